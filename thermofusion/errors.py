@@ -1,0 +1,64 @@
+"""What can go wrong, one small family.
+
+Every error is one sentence with its cause, the place (a file, a key, a frame) and the next step. The command line
+catches `ThermofusionError` in one place, prints it, and exits with the class's `exit_code`.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+
+class ThermofusionError(Exception):
+    """Root of all errors that a user can act on.
+
+    Parameters
+    ----------
+    cause : what is wrong, as a clause ("depth is 8-bit, expected 16-bit grey").
+    place : the file, key or frame range it is about.
+    hint : the next step ("record with 16-bit depth").
+    """
+
+    exit_code: ClassVar[int] = 1
+
+    def __init__(self, cause: str, *, place: object = None, hint: str | None = None) -> None:
+        self.cause = cause.rstrip(".")
+        self.place = None if place is None else str(place)
+        self.hint = None if hint is None else hint.rstrip(".")
+        super().__init__(self.sentence())
+
+    def sentence(self) -> str:
+        """The one sentence a user reads: `place: cause; next step`."""
+        head = f"{self.place}: " if self.place else ""
+        tail = f"; {self.hint}" if self.hint else ""
+        return f"{head}{self.cause}{tail}"
+
+
+class RecipeError(ThermofusionError):
+    """A recipe or an option is wrong (usage)."""
+
+    exit_code = 2
+
+
+class ScanError(ThermofusionError):
+    """The input cannot be used: missing, torn, inconsistent, or without overlap."""
+
+    exit_code = 3
+
+
+class QualityError(ThermofusionError):
+    """The result was written and marked, but lies below the recipe's quality gate."""
+
+    exit_code = 4
+
+
+class ResourceError(ThermofusionError):
+    """Memory, disk or a device is not sufficient or not there."""
+
+    exit_code = 5
+
+
+class BatchError(ThermofusionError):
+    """Some scans of a batch failed; the others are done."""
+
+    exit_code = 6

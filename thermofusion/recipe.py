@@ -1,0 +1,271 @@
+"""The recipe: everything a person may choose about processing, in one strict tree.
+
+Recipes are TOML files. Units stand in the key names. Unknown keys are errors that name the nearest match. Precedence:
+the defaults here < the file < `--set section.key=value`. The resolved recipe is written beside every result.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import tomli_w
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from .errors import RecipeError
+from .resources import recipes_dir
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class InputSection(_Section):
+    """How streams are paired and which depth is believed."""
+
+    pair_tolerance_ms: float = Field(
+        40.0, gt=0, description="a colour frame farther in time from its depth frame is left out"
+    )
+    max_pose_gap_ms: float = Field(
+        500.0, gt=0, description="a thermal frame in a longer gap of the trajectory is left out"
+    )
+    min_depth_m: float = Field(0.4, ge=0, description="nearer depth is dropped")
+    max_depth_m: float = Field(3.0, gt=0, description="farther depth is dropped")
+    max_grazing_deg: float = Field(80.0, gt=0, le=90, description="depth seen more obliquely is dropped")
+    flying_pixel_mm: float = Field(
+        25.0,
+        gt=0,
+        description="a pixel that stands this far from its neighbours at 1 m is dropped (scales with range²)",
+    )
+
+
+class SubjectSection(_Section):
+    """What belongs to the subject and what is room."""
+
+    background: Literal["keep", "remove"] = Field(
+        "remove", description="remove what stands beyond the subject before tracking"
+    )
+    floor: Literal["auto", "keep", "remove"] = Field("auto", description="auto: removed where a floor plane is found")
+    floor_clearance_mm: float = Field(
+        12.0, ge=0, description="surface nearer than this to the floor plane goes with it"
+    )
+    motion: Literal["camera", "subject"] = Field(
+        "camera", description="subject: the camera stands still and the subject turns"
+    )
+    keep_components: int = Field(
+        1, ge=0, description="largest connected pieces of surface kept; 0 = all above min_component_cm2"
+    )
+    min_component_cm2: float = Field(50.0, ge=0, description="smaller pieces of surface are dropped")
+
+
+class TrackingSection(_Section):
+    """Where the depth camera was. Recorded trajectories are used as they are unless `refine`."""
+
+    source: Literal["auto", "recorded", "estimate"] = Field("auto", description="auto: recorded where there is one")
+    refine: bool = Field(False, description="a recorded trajectory is only a start, refined like an estimated one")
+    color: bool = Field(True, description="colour helps where a colour camera was recorded")
+    fragment_frames: int = Field(8, ge=2, description="consecutive frames fused before loop closure")
+    loop_closure: bool = True
+    refine_to_model: bool = Field(True, description="a last alignment of every frame with the fused model")
+    min_fitness: float = Field(0.5, gt=0, le=1, description="share of a frame's points that must find a partner")
+    max_residual_mm: float = Field(
+        8.0, gt=0, description="median point-to-plane distance at 1 m above which a frame is lost"
+    )
+
+
+class FusionSection(_Section):
+    """Depth frames into one surface (TSDF)."""
+
+    voxel_mm: Literal["auto"] | float = Field(
+        "auto", description="edge of a voxel; auto: from depth noise and thermal footprint"
+    )
+    truncation_voxels: float = Field(6.0, gt=1, description="TSDF truncation in voxels")
+    min_weight: float = Field(3.0, ge=0, description="surface seen by fewer depth frames is dropped")
+    normal_window_mm: float = Field(
+        25.0, gt=0, description="normals are averaged over this diameter (20-30 mm for Kinect)"
+    )
+    smooth_iterations: int = Field(0, ge=0, description="Taubin smoothing steps of the mesh")
+    max_memory_gib: float = Field(2.0, gt=0, description="bound on the voxel grid's memory; the voxel grows to meet it")
+    color: bool = Field(True, description="colour the surface from the colour camera")
+
+
+class MappingSection(_Section):
+    """Thermal views onto the surface."""
+
+    silhouette_px: float = Field(3.0, ge=0, description="pixels nearer to a silhouette or depth edge are rejected")
+    border_px: float = Field(8.0, ge=0, description="pixels nearer to the image border are rejected")
+    max_angle_deg: float = Field(
+        65.0, gt=0, lt=90, description="more oblique views count only where nothing better saw the spot"
+    )
+    last_resort_angle_deg: float = Field(75.0, gt=0, lt=90, description="beyond this a view is never used")
+    visibility_tolerance_mm: float = Field(
+        8.0, gt=0, description="how far behind the visible surface a vertex may lie and still count as seen"
+    )
+
+
+class EmissivitySection(_Section):
+    """ε(θ) of the surface."""
+
+    model: Literal["dielectric", "non-dielectric", "cosine", "water", "tabulated", "fitted", "blackbody"] = "dielectric"
+    n: float = Field(1.33, gt=1, description="refractive index (dielectric, non-dielectric, fitted)")
+    k: float = Field(0.0, ge=0, description="extinction coefficient (non-dielectric, fitted)")
+    epsilon0: float | None = Field(
+        None, gt=0, le=1, description="emissivity straight on; scales the model's curve to it"
+    )
+    angles_deg: list[float] = Field(default_factory=list, description="tabulated: angles, rising from 0")
+    values: list[float] = Field(default_factory=list, description="tabulated: ε at those angles")
+
+
+class RadiometrySection(_Section):
+    """From signal to temperature."""
+
+    method: Literal["joint", "corrected-cos", "cos-resolution", "mean", "nearest-view", "paper"] = Field(
+        "joint", description="joint = cross-calibrated views; the others are for comparison"
+    )
+    output: Literal["absolute", "normal-equivalent", "apparent"] = Field(
+        "absolute", description="what scalar_temperature holds"
+    )
+    weight: Literal["inverse-variance", "cos-resolution"] = "inverse-variance"
+    reflected_degC: float | None = Field(None, description="overrides the scan's environment")
+    air_degC: float | None = Field(None, description="overrides the scan's environment")
+    transmission_per_m: float = Field(
+        1.0, gt=0, le=1, description="of the air path; 1 = neglected, its size stands in the budget"
+    )
+    sigma_reflected_K: float = Field(1.0, ge=0, description="uncertainty of the reflected temperature")
+    sigma_normal_deg: float | None = Field(
+        None, ge=0, description="of surface normals; None = estimated from depth noise and window"
+    )
+    sigma_registration_px: float = Field(0.5, ge=0, description="of the thermal image on the mesh")
+    sigma_emissivity0: float = Field(0.01, ge=0, description="of ε(0): enters the absolute level")
+    sigma_shape: float = Field(0.15, ge=0, description="relative uncertainty of 1-ε(θ)'s shape")
+
+
+class CrosscalSection(_Section):
+    """What overlapping views are asked to settle."""
+
+    offsets: bool = Field(True, description="one offset per thermal view (drift, shutter jumps)")
+    vignetting: bool = Field(True, description="one low-order field over the image, common to all views")
+    shape: bool = Field(True, description="the shape of ε(θ), where the overlap carries it")
+    gain: bool = Field(False, description="one gain of the camera, where references carry it")
+    surroundings: bool = Field(True, description="the body's own radiation, reflected in folds")
+    align: bool = Field(True, description="refine the rig extrinsic and the thermal clock where the data support it")
+    motion: bool = Field(False, description="small rigid correction of each view (breathing, sway)")
+    max_vertices: int = Field(40_000, ge=1000, description="vertices the solver uses; all are mapped")
+
+
+class OutputSection(_Section):
+    """What is written."""
+
+    formats: list[Literal["ply", "glb", "vtp"]] = ["ply", "glb", "vtp"]
+    views: bool = Field(True, description="views/*.png")
+    palette: Literal["inferno", "iron", "grey", "cividis", "rainbow"] = "inferno"
+    range_degC: tuple[float, float] | None = Field(None, description="colour range; None = 1st to 99th percentile")
+
+
+class QualitySection(_Section):
+    """The gate: below it the result is written, marked, and the exit code is 4."""
+
+    min_tracked_fraction: float = Field(0.8, ge=0, le=1)
+    min_coverage: float = Field(0.5, ge=0, le=1, description="share of the surface with a temperature")
+    max_median_sigma_K: float = Field(0.5, gt=0)
+
+
+class Recipe(_Section):
+    """The whole tree."""
+
+    name: str = "custom"
+    description: str = ""
+    input: InputSection = InputSection()
+    subject: SubjectSection = SubjectSection()
+    tracking: TrackingSection = TrackingSection()
+    fusion: FusionSection = FusionSection()
+    mapping: MappingSection = MappingSection()
+    emissivity: EmissivitySection = EmissivitySection()
+    radiometry: RadiometrySection = RadiometrySection()
+    crosscal: CrosscalSection = CrosscalSection()
+    output: OutputSection = OutputSection()
+    quality: QualitySection = QualitySection()
+
+    def to_toml(self) -> str:
+        """The resolved recipe as TOML; keys whose value is None are left out (their default)."""
+        return tomli_w.dumps(self.model_dump(exclude_none=True, mode="json"))
+
+
+def load_recipe(source: str | Path | Mapping[str, Any] = "torso", overrides: Sequence[str] = ()) -> Recipe:
+    """A recipe from a shipped name ("torso"), a TOML file, or a mapping, with `section.key=value` overrides.
+
+    Raises RecipeError naming the key, its nearest match, or what the value must be.
+    """
+    if isinstance(source, Mapping):
+        tree, place = {**source}, "recipe"
+    else:
+        path = find_recipe(source)
+        place = str(path)
+        try:
+            tree = tomllib.loads(path.read_text(encoding="utf-8"))
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
+            raise RecipeError(f"not a TOML file: {e}", place=place) from None
+    for item in overrides:
+        _override(tree, item)
+    try:
+        return Recipe.model_validate(tree)
+    except ValidationError as e:
+        raise RecipeError(_first_fault(e), place=place) from None
+
+
+def find_recipe(source: str | Path) -> Path:
+    """Path of a recipe: an existing file, else a shipped recipe of that name."""
+    path = Path(source)
+    if path.suffix == ".toml" or path.is_file():
+        if not path.is_file():
+            raise RecipeError("there is no such recipe file", place=path)
+        return path
+    shipped = recipes_dir() / f"{source}.toml"
+    if shipped.is_file():
+        return shipped
+    raise RecipeError(
+        f"there is no recipe '{source}'{_nearest(str(source), shipped_recipes())}",
+        hint="`thermofusion recipe list` shows the shipped ones",
+    )
+
+
+def shipped_recipes() -> list[str]:
+    """Names of the recipes that come with the package."""
+    return sorted(p.stem for p in recipes_dir().glob("*.toml"))
+
+
+def _override(tree: dict[str, Any], item: str) -> None:
+    key, sep, text = item.partition("=")
+    if not sep or not key.strip():
+        raise RecipeError(f"--set needs section.key=value, got '{item}'")
+    try:
+        value = json.loads(text)
+    except json.JSONDecodeError:
+        value = text
+    node: dict[str, Any] = tree
+    *parents, last = key.strip().split(".")
+    for part in parents:
+        node[part] = dict(node.get(part, {}))
+        node = node[part]
+    node[last] = value
+
+
+def _first_fault(error: ValidationError) -> str:
+    """One sentence on the first fault, with the nearest known key for an unknown one."""
+    fault = error.errors()[0]
+    loc = [str(p) for p in fault["loc"]]
+    if fault["type"] == "extra_forbidden":
+        model: Any = Recipe
+        for part in loc[:-1]:
+            model = model.model_fields[part].annotation
+        return f"unknown key '{'.'.join(loc)}'{_nearest(loc[-1], list(model.model_fields))}"
+    return f"key '{'.'.join(loc)}': {fault['msg'][0].lower()}{fault['msg'][1:]}, got {fault['input']!r}"
+
+
+def _nearest(word: str, known: Sequence[str]) -> str:
+    match = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    return f" (did you mean '{match[0]}'?)" if match else ""

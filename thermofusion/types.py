@@ -1,0 +1,305 @@
+"""The nouns of the method: frozen, validated, independent of files and of Open3D.
+
+Conventions (docs/conventions.md): metres, seconds, pixels; `T_a_b` takes a point from frame b to frame a; camera frames
+are x right, y down, z forward; the centre of the first pixel is (0, 0). NaN means unmeasured, never 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Int = NDArray[np.int32]
+Bool = NDArray[np.bool_]
+UInt8 = NDArray[np.uint8]
+
+RIGID_TOLERANCE = 1e-4  # deviation of RᵀR from identity: hand-typed extrinsics carry 5-6 digits
+
+
+def check_rigid(T: object, name: str) -> Float:
+    """A 4x4 rigid transform as float64, rotation re-orthonormalised. Raises ValueError naming `name`."""
+    M = np.asarray(T, dtype=np.float64)
+    if M.shape != (4, 4):
+        raise ValueError(f"{name} must be a 4x4 matrix, got shape {M.shape}")
+    if not np.isfinite(M).all():
+        raise ValueError(f"{name} has entries that are not finite numbers")
+    R = M[:3, :3]
+    if np.abs(R.T @ R - np.eye(3)).max() > RIGID_TOLERANCE or np.linalg.det(R) < 0:
+        raise ValueError(f"{name} is no rigid transform: its 3x3 part is not a rotation")
+    if np.abs(M[3] - [0, 0, 0, 1]).max() > 1e-9:
+        raise ValueError(f"{name} must have the last row 0 0 0 1")
+    U, _, Vt = np.linalg.svd(R)
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = U @ Vt, M[:3, 3]
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera with OpenCV distortion.
+
+    Attributes
+    ----------
+    width_px, height_px : image size.
+    K : (3, 3) intrinsic matrix, pixels, first pixel centre at (0, 0).
+    distortion : (5,) `[k1 k2 p1 p2 k3]` or (8,) rational `[k1 k2 p1 p2 k3 k4 k5 k6]`, OpenCV order; zeros = none.
+
+    Raises ValueError if K is not an intrinsic matrix or the distortion has another length.
+    """
+
+    width_px: int
+    height_px: int
+    K: Float
+    distortion: Float = field(default_factory=lambda: np.zeros(5))
+
+    def __post_init__(self) -> None:
+        K, d = np.asarray(self.K, dtype=np.float64), np.asarray(self.distortion, dtype=np.float64).ravel()
+        if not (0 < self.width_px <= 32767 and 0 < self.height_px <= 32767):
+            raise ValueError(f"an image of {self.width_px} x {self.height_px} px is not usable")
+        if K.shape != (3, 3) or not np.isfinite(K).all():
+            raise ValueError("K must be a finite 3x3 matrix")
+        if K[0, 0] <= 0 or K[1, 1] <= 0 or np.abs(K[2] - [0, 0, 1]).max() > 1e-9 or abs(K[1, 0]) > 1e-9:
+            raise ValueError("K is not a camera matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+        if abs(K[0, 1]) > 1e-9:
+            raise ValueError("K has a skew term, which no step supports")
+        if d.size in (0, 1):
+            d = np.zeros(5)
+        if d.size == 4:
+            d = np.append(d, 0.0)
+        if d.size not in (5, 8) or not np.isfinite(d).all():
+            raise ValueError("distortion must be [k1 k2 p1 p2 k3] or the 8-term rational form")
+        object.__setattr__(self, "K", K)
+        object.__setattr__(self, "distortion", d)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width), the shape of an image array."""
+        return self.height_px, self.width_px
+
+    @property
+    def focal_px(self) -> float:
+        """Geometric mean of fx and fy."""
+        return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
+
+    @property
+    def is_distorted(self) -> bool:
+        return bool(np.any(self.distortion != 0))
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """The cameras on one frame and where they sit. `color` and `thermal` are optional, each with its extrinsic."""
+
+    depth: Camera
+    thermal: Camera | None = None
+    T_thermal_depth: Float | None = None
+    color: Camera | None = None
+    T_color_depth: Float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("thermal", "color"):
+            camera, key = getattr(self, name), f"T_{name}_depth"
+            if (camera is None) != (getattr(self, key) is None):
+                raise ValueError(f"the {name} camera and {key} must be given together")
+            if camera is not None:
+                object.__setattr__(self, key, check_rigid(getattr(self, key), key))
+
+
+@dataclass(frozen=True, eq=False)
+class SignalCurve:
+    """How a stored thermal pixel becomes a temperature.
+
+    kind : `counts` (through one of the curves), `apparent_degC`, or `radiance` (W m-2 sr-1 in band).
+    curve : `polynomial` (T_degC = Σ c_i g^i, Eq. 1), `linear_kelvin`, `planck` (T_K = B / ln(R/(S-O) + F)), `table`,
+        or `none`.
+    parameters : by curve: `coefficients_degC`; `gain_K`, `offset_K`; `R B F O`; `counts`, `degC`.
+    """
+
+    kind: Literal["counts", "apparent_degC", "radiance"] = "apparent_degC"
+    curve: Literal["polynomial", "linear_kelvin", "planck", "table", "none"] = "none"
+    parameters: dict[str, tuple[float, ...]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class ThermalSensor:
+    """What the radiometry must know of the thermal camera."""
+
+    signal: SignalCurve
+    band_um: tuple[float, float] = (7.5, 13.5)
+    netd_K: float = 0.05
+    time_offset_s: float = 0.0  # added to a thermal frame's own time to get the depth clock's time
+    psf_sigma_px: float | None = None  # optical + pixel point spread; None = not measured
+
+
+@dataclass(frozen=True, eq=False)
+class Environment:
+    """The room. None = the recording does not say."""
+
+    reflected_degC: float | None = None
+    air_degC: float | None = None
+    relative_humidity_pct: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class BlackbodyReference:
+    """A source of known temperature that stands in some thermal frames, at a fixed place in the image."""
+
+    degC: float
+    uncertainty_K: float
+    emissivity: float
+    polygon_px: Float  # (N, 2) thermal pixels
+    frames: tuple[int, ...]  # `index` of thermal frames
+    kind: Literal["blackbody"] = "blackbody"
+
+
+@dataclass(frozen=True, eq=False)
+class ContactReference:
+    """A thermometer's reading at a point of the skin."""
+
+    degC: float
+    uncertainty_K: float
+    p_world_m: Float  # (3,)
+    kind: Literal["contact"] = "contact"
+
+
+Reference = BlackbodyReference | ContactReference
+
+
+@dataclass(frozen=True, eq=False)
+class Stream:
+    """One camera's images in time order.
+
+    times_s : (N,) float64, strictly increasing, this stream's own clock.
+    load : i -> image. Depth: (H, W) float32 metres, NaN = none. Colour: (H, W, 3) uint8 sRGB in R, G, B order.
+        Thermal: (H, W) as stored (uint16 counts, float32 °C or radiance): `radiometry` converts.
+    places : where each image came from, for messages.
+    index : (N,) the recording's own numbers (references name thermal frames by them).
+    usable : (N,) False for thermal frames during or just after a shutter correction, and frames a reader rejects.
+    """
+
+    times_s: Float
+    load: Callable[[int], NDArray]
+    places: tuple[str, ...]
+    index: NDArray[np.int64]
+    usable: Bool
+
+    def __post_init__(self) -> None:
+        if not (len(self.times_s) == len(self.places) == len(self.index) == len(self.usable)):
+            raise ValueError("times, places, index and usable of a stream differ in length")
+
+    def __len__(self) -> int:
+        return len(self.times_s)
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Poses of the depth camera.
+
+    times_s : (N,) strictly increasing, depth clock. T_world_depth : (N, 4, 4).
+    """
+
+    times_s: Float
+    T_world_depth: Float
+
+    def __post_init__(self) -> None:
+        t, T = np.asarray(self.times_s, np.float64), np.asarray(self.T_world_depth, np.float64)
+        if T.shape != (len(t), 4, 4):
+            raise ValueError(f"a trajectory of {len(t)} times needs ({len(t)}, 4, 4) poses, got {T.shape}")
+        if not (np.isfinite(t).all() and np.isfinite(T).all()):
+            raise ValueError("the trajectory has a pose that is not finite")
+        if len(t) > 1 and not (np.diff(t) > 0).all():
+            raise ValueError("the trajectory's times run backwards or repeat")
+        object.__setattr__(self, "times_s", t)
+        object.__setattr__(self, "T_world_depth", T)
+
+    def __len__(self) -> int:
+        return len(self.times_s)
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """A recording, whatever format it came from: the one input of the method."""
+
+    name: str
+    root: Path
+    format: str
+    rig: Rig
+    depth: Stream
+    color: Stream | None = None
+    thermal: Stream | None = None
+    sensor: ThermalSensor | None = None
+    environment: Environment = field(default_factory=Environment)
+    references: tuple[Reference, ...] = ()
+    trajectory: Trajectory | None = None
+    depth_unit_m: float = 0.001
+    recorded_at: str | None = None
+    subject: dict[str, object] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()  # what the reader had to assume, or kept without understanding
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceMesh:
+    """A triangle mesh in the world frame.
+
+    vertices_m : (V, 3) float32. triangles : (F, 3) int32, counter-clockwise from outside. normals : (V, 3) float32,
+    unit, outward, smoothed over the recipe's window. color_rgb : (V, 3) uint8 sRGB of the colour camera, or None.
+    """
+
+    vertices_m: Float32
+    triangles: Int
+    normals: Float32
+    color_rgb: UInt8 | None = None
+
+    def __len__(self) -> int:
+        return len(self.vertices_m)
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Every time a thermal view saw a vertex, as columns of equal length N, sorted by (view, vertex).
+
+    vertex : (N,) int32. view : (N,) int32, row of the thermal views used. radiance : (N,) float32, in band, W m-2 sr-1,
+    as the camera reports it (apparent). cos_angle : (N,) float32, of the angle between normal and the pixel's own ray.
+    range_m : (N,) float32. footprint_m2 : (N,) float32 = range²/(f² cosθ), surface area seen by a pixel.
+    u_px, v_px : (N,) float32 image position. edge_px : (N,) float32 distance to the nearest silhouette, capped.
+    """
+
+    vertex: Int
+    view: Int
+    radiance: Float32
+    cos_angle: Float32
+    range_m: Float32
+    footprint_m2: Float32
+    u_px: Float32
+    v_px: Float32
+    edge_px: Float32
+
+    def __len__(self) -> int:
+        return len(self.vertex)
+
+    def select(self, mask: NDArray) -> Observations:
+        """The rows of a boolean mask or index array."""
+        return Observations(**{k: getattr(self, k)[mask] for k in self.__dataclass_fields__})
+
+
+@dataclass(frozen=True, eq=False)
+class ThermalViews:
+    """The thermal frames that entered the result, one row a view.
+
+    frame : (N,) position in the thermal stream. times_s : (N,) on the depth clock, offset included.
+    T_world_thermal : (N, 4, 4).
+    """
+
+    frame: Int
+    times_s: Float
+    T_world_thermal: Float
+
+    def __len__(self) -> int:
+        return len(self.frame)
