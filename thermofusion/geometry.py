@@ -85,8 +85,8 @@ def rotation_angle_deg(T: Float) -> Float:
 def interpolate_trajectory(trajectory: Trajectory, times_s: Float, *, max_gap_s: float = np.inf) -> tuple[Float, Bool]:
     """Poses at other times, along the geodesic of SE(3) between neighbours.
 
-    Returns ((N, 4, 4) T_world_depth, (N,) valid). Not valid: before the first or after the last pose by more than half
-    a median step (within that the end pose is extrapolated by the last motion), or inside a gap longer than `max_gap_s`.
+    Returns ((N, 4, 4) T_world_depth, (N,) valid). Not valid: before the first or after the last pose by more than
+    half a median step (within that the last motion is continued), or inside a gap longer than `max_gap_s`.
     """
     t, T = trajectory.times_s, trajectory.T_world_depth
     times_s = np.atleast_1d(np.asarray(times_s, np.float64))

@@ -154,8 +154,10 @@ def read_native(root: Path) -> Scan:
             raise ScanError(f"key 'extrinsics.T_{name}_depth' is needed for the {name} camera", place=path)
     try:
         arrays = {k: None if v is None else np.array(v, np.float64) for k, v in extrinsics.items()}
+        depth_camera = cameras["depth"]
+        assert depth_camera is not None  # the schema requires it
         rig = Rig(
-            cameras["depth"], cameras["thermal"], arrays["T_thermal_depth"], cameras["color"], arrays["T_color_depth"]
+            depth_camera, cameras["thermal"], arrays["T_thermal_depth"], cameras["color"], arrays["T_color_depth"]
         )
     except ValueError as e:
         raise ScanError(f"key 'extrinsics': {e}", place=path) from None
