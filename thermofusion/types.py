@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from enum import IntFlag
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -303,3 +304,89 @@ class ThermalViews:
 
     def __len__(self) -> int:
         return len(self.frame)
+
+
+class VertexFlag(IntFlag):
+    """What a reader of a vertex's temperature must know; one bit each, 0 = nothing to say."""
+
+    UNMEASURED = 1  # no thermal view counts here: the temperature is NaN
+    SINGLE_VIEW = 2  # one view only: nothing checks it
+    OBLIQUE = 4  # the best view is steeper than the recipe's limit
+    CAVITY = 8  # the spot sees much of the body itself (armpit, fold)
+    HIGH_RESIDUAL = 16  # views disagree by more than their uncertainty explains
+    MOVED = 32  # the subject moved between views
+
+
+OutputMode = Literal["absolute", "normal-equivalent", "apparent"]
+
+
+@dataclass(frozen=True, eq=False)
+class ThermalMesh:
+    """The result: a surface whose every vertex carries a temperature. All arrays are per vertex, (V,).
+
+    temperature_degC : float32, NaN = unmeasured; in the sense of `mode`. anchored : False = the level is relative (no
+    reference settled it). apparent_degC : as a blackbody camera would read it, mean of the views. uncertainty_K : one
+    sigma of `temperature_degC`. view_angle_deg, distance_m : best (straightest) view's. observations : int32, thermal
+    views that count. flags : uint8, bits of `VertexFlag`; UNMEASURED is set here wherever the temperature is NaN.
+    uncertainty_parts : named parts of the budget, K, float32. metadata : frame, units, recipe, version, and `up` and
+    `front` as "x y z" in the world frame (see `export.axes`). Raises ValueError on lengths or values that cannot be.
+    """
+
+    surface: SurfaceMesh
+    temperature_degC: Float32
+    mode: OutputMode
+    anchored: bool
+    apparent_degC: Float32
+    uncertainty_K: Float32
+    view_angle_deg: Float32
+    distance_m: Float32
+    observations: Int
+    flags: UInt8
+    uncertainty_parts: dict[str, Float32] = field(default_factory=dict)
+    metadata: dict[str, str | float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.mode not in get_args(OutputMode):
+            raise ValueError(f"the output mode must be one of {', '.join(get_args(OutputMode))}, got '{self.mode}'")
+        columns = {n: getattr(self, n) for n in ("temperature_degC", "apparent_degC", "uncertainty_K")}
+        columns |= {n: getattr(self, n) for n in ("view_angle_deg", "distance_m")}
+        for name, values in columns.items():
+            object.__setattr__(self, name, self._column(values, name, np.float32))
+        object.__setattr__(self, "observations", self._column(self.observations, "observations", np.int32))
+        flags = self._column(self.flags, "flags", np.uint8) & np.uint8(0xFF & ~VertexFlag.UNMEASURED)
+        unmeasured = np.isnan(self.temperature_degC).astype(np.uint8) * np.uint8(VertexFlag.UNMEASURED)
+        object.__setattr__(self, "flags", flags | unmeasured)
+        parts = {k: self._column(v, f"uncertainty_parts['{k}']", np.float32) for k, v in self.uncertainty_parts.items()}
+        object.__setattr__(self, "uncertainty_parts", parts)
+
+    def _column(self, values: object, name: str, dtype: DTypeLike) -> NDArray:
+        column = np.ascontiguousarray(values, dtype=dtype)
+        if column.shape != (len(self.surface),):
+            raise ValueError(f"{name} has shape {column.shape}, the surface has {len(self.surface)} vertices")
+        if np.isinf(column).any():
+            raise ValueError(f"{name} has an infinite value; NaN means unmeasured")
+        return column
+
+    def __len__(self) -> int:
+        return len(self.surface)
+
+    @property
+    def measured(self) -> Bool:
+        """(V,) True where there is a temperature."""
+        return ~np.isnan(self.temperature_degC)
+
+    @classmethod
+    def from_temperature(
+        cls,
+        surface: SurfaceMesh,
+        temperature_degC: NDArray,
+        *,
+        mode: OutputMode = "absolute",
+        anchored: bool = True,
+        metadata: dict[str, str | float] | None = None,
+    ) -> ThermalMesh:
+        """A mesh of which only the temperature is known (a truth, a foreign file): everything else NaN or 0."""
+        nan = np.full(len(surface), np.nan, np.float32)
+        count, flags = np.zeros(len(surface), np.int32), np.zeros(len(surface), np.uint8)
+        known = dict(metadata or {})
+        return cls(surface, temperature_degC, mode, anchored, nan, nan, nan, nan, count, flags, metadata=known)
