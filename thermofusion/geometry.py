@@ -192,4 +192,4 @@ def viewing_cosine(points: NDArray, normals: NDArray, eye: NDArray) -> NDArray:
     The pixel's own ray, not the camera axis of the paper's Eq. 28; negative for back faces.
     """
     d = eye.astype(points.dtype) - points
-    return np.einsum("ij,ij->i", d, normals) / np.linalg.norm(d, axis=1)
+    return np.einsum("ij,ij->i", d, normals) / np.sqrt(np.einsum("ij,ij->i", d, d))
