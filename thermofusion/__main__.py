@@ -1,0 +1,5 @@
+"""`python -m thermofusion`."""
+
+from .cli import main
+
+main()

@@ -1,0 +1,60 @@
+"""`thermofusion`: verbs over the library. The only place that prints, and the only place that exits.
+
+Results go to stdout (`--json` for one object), progress to stderr. Slow libraries are imported inside the
+verbs, so that `--help` answers at once.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from .. import __version__
+from ..errors import ThermofusionError
+from . import calibrate, inspect, judge, process, recordings
+from .console import fail
+
+INTERRUPTED = 130
+
+app = typer.Typer(
+    name="thermofusion",
+    help="3D models whose every point carries its true skin temperature, from a depth camera and a thermal camera.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+for group in (process, inspect, recordings, judge, calibrate):
+    group.register(app)
+
+
+@app.callback()
+def _root(
+    version: bool = typer.Option(False, "--version", help="Print the version and exit.", is_eager=True),
+) -> None:
+    if version:
+        print(f"thermofusion {__version__}")
+        raise typer.Exit
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Entry point: every error of ours becomes one sentence on stderr and its own exit code."""
+    arguments = sys.argv[1:] if argv is None else argv
+    as_json = "--json" in arguments
+    try:
+        code = app(args=arguments, standalone_mode=False)
+    except ThermofusionError as e:
+        fail(e.sentence(), e.exit_code, as_json)
+    except (KeyboardInterrupt, typer.Abort):
+        fail("interrupted; what was computed is kept and the next run continues from there", INTERRUPTED, as_json)
+    except MemoryError:
+        fail("out of memory; choose a larger fusion.voxel_mm or a smaller --max-memory", 5, as_json)
+    except Exception as e:
+        if hasattr(e, "format_message"):  # a usage error of the command line itself
+            fail(f"{e.format_message()} (see --help)", 2, as_json)
+        raise
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+__all__ = ["app", "main"]

@@ -1,0 +1,74 @@
+"""How the command line speaks: progress on stderr, results on stdout, one JSON object on request."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import NoReturn
+
+from ..rundir import to_json
+
+Progress = Callable[[str, int, int], None]
+
+
+def fail(sentence: str, code: int, as_json: bool) -> NoReturn:
+    """Print one sentence (or one JSON object) and exit with the code."""
+    if as_json:
+        print(to_json({"error": sentence, "exit_code": code}))
+    print(f"error: {sentence}", file=sys.stderr)
+    sys.exit(code)
+
+
+def emit(value: object, text: str, as_json: bool) -> None:
+    """The result: JSON for programs, text for people."""
+    print(to_json(value) if as_json else text)
+
+
+def note(text: str) -> None:
+    """A line for people, beside the result."""
+    print(text, file=sys.stderr)
+
+
+@contextmanager
+def progress(quiet: bool = False) -> Iterator[Progress]:
+    """A callback (stage, done, total): a live bar on a terminal, one plain line per stage elsewhere."""
+    if quiet:
+        yield lambda stage, done, total: None
+    elif sys.stderr.isatty():
+        with _bars() as bars:
+            yield bars
+    else:
+        yield _Lines()
+
+
+@contextmanager
+def _bars() -> Iterator[Progress]:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Live
+
+    columns = (TextColumn("{task.description:<12}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Live(*columns, console=Console(stderr=True)) as live:
+        tasks: dict[str, int] = {}
+
+        def step(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = live.add_task(stage, total=total)
+            live.update(tasks[stage], completed=done, total=total)  # type: ignore[arg-type]
+
+        yield step
+
+
+class _Lines:
+    """`stage: done in 1.2 s`, once per stage."""
+
+    def __init__(self) -> None:
+        self._start: dict[str, float] = {}
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        start = self._start.setdefault(stage, time.monotonic())
+        if done >= total and start >= 0:
+            print(f"{stage}: {total} done in {time.monotonic() - start:.1f} s", file=sys.stderr)
+            self._start[stage] = -1.0

@@ -1,0 +1,94 @@
+"""Verbs that look and change nothing: doctor, check, recipe."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .console import emit, note
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+recipes = typer.Typer(help="The processing recipes: list, show, validate.", no_args_is_help=True)
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's verbs."""
+    app.command()(doctor)
+    app.command()(check)
+    app.add_typer(recipes, name="recipe")
+
+
+def doctor(json: Json = False) -> int:
+    """Versions, libraries, memory, cameras and USB permissions: what works here."""
+    from ..doctor import examine
+
+    findings = examine()
+    sign = {"ok": "ok     ", "warning": "warning", "problem": "PROBLEM"}
+    emit(findings, "\n".join(f"{sign[f.status]}  {f.subject}: {f.text}" for f in findings), json)
+    return 5 if any(f.status == "problem" for f in findings) else 0
+
+
+def check(
+    scan: Annotated[Path, typer.Argument(help="A scan folder, or a foreign recording.")],
+    format: Annotated[str | None, typer.Option(help="Format of the recording; recognised by default.")] = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder for overlay pictures.")] = None,
+    rig: Annotated[Path | None, typer.Option(help="Overlay this rig.json instead of the scan's own.")] = None,
+    json: Json = False,
+) -> int:
+    """Streams, sync, units, extrinsics, overlay pictures, missing metadata of a recording."""
+    from ..check import check_scan, overlays
+    from ..pictures import write_png
+    from ..scans import open_scan, with_rig
+
+    recording = open_scan(scan, format=format)
+    if rig is not None:
+        recording = with_rig(recording, rig)
+    report = check_scan(recording)
+    pictures = []
+    if out is not None:
+        for name, image in overlays(recording).items():
+            write_png(out / f"{name}.png", image)
+            pictures.append(out / f"{name}.png")
+    emit({**vars(report), "pictures": pictures}, report.text(), json)
+    for picture in pictures:
+        note(f"wrote {picture}")
+    return 3 if report.unusable else 0
+
+
+@recipes.command("list")
+def recipe_list(json: Json = False) -> None:
+    """The shipped recipes."""
+    from ..recipe import load_recipe, shipped_recipes
+
+    found = {name: load_recipe(name).description for name in shipped_recipes()}
+    emit(found, "\n".join(f"{name:<18} {text}" for name, text in found.items()), json)
+
+
+@recipes.command("show")
+def recipe_show(
+    recipe: Annotated[str, typer.Argument(help="A shipped name or a TOML file.")],
+    set_: Annotated[list[str] | None, typer.Option("--set", help="section.key=value")] = None,
+    source: Annotated[bool, typer.Option("--source", help="The commented file instead of every resolved key.")] = False,
+    json: Json = False,
+) -> None:
+    """A recipe with every key it resolves to, or (--source) the commented file."""
+    from ..recipe import find_recipe, load_recipe
+
+    resolved = load_recipe(recipe, set_ or ())
+    text = find_recipe(recipe).read_text(encoding="utf-8") if source else resolved.to_toml()
+    emit(resolved, text.rstrip(), json)
+
+
+@recipes.command("validate")
+def recipe_validate(
+    recipe: Annotated[str, typer.Argument(help="A shipped name or a TOML file.")],
+    set_: Annotated[list[str] | None, typer.Option("--set", help="section.key=value")] = None,
+    json: Json = False,
+) -> None:
+    """Whether a recipe is valid; an unknown key is named with its nearest match."""
+    from ..recipe import load_recipe
+
+    resolved = load_recipe(recipe, set_ or ())
+    emit({"valid": True, "name": resolved.name}, f"{recipe}: valid", json)

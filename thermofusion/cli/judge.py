@@ -1,0 +1,9 @@
+"""Verbs that judge results: validate, compare, paper."""
+
+from __future__ import annotations
+
+import typer
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's verbs."""

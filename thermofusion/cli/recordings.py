@@ -1,0 +1,56 @@
+"""Verbs that make scans: import, simulate."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .console import emit
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+Force = Annotated[bool, typer.Option("--overwrite", help="Replace an existing scan folder.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's verbs."""
+    app.command("import")(import_)
+    app.command()(simulate)
+
+
+def import_(
+    recording: Annotated[Path, typer.Argument(help="A foreign recording.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Scan folder to write.")],
+    format: Annotated[str | None, typer.Option(help="Format of the recording; recognised by default.")] = None,
+    overwrite: Force = False,
+    json: Json = False,
+) -> None:
+    """Write a foreign recording in the native scan form."""
+    from ..scans import open_scan
+    from ..scans.write import write_scan
+
+    scan = open_scan(recording, format=format)
+    write_scan(scan, out, overwrite=overwrite)
+    streams = {name: len(s) for name in ("depth", "color", "thermal") if (s := getattr(scan, name)) is not None}
+    counts = ", ".join(f"{n} {name}" for name, n in streams.items())
+    emit(
+        {"scan": out, "format": scan.format, "frames": streams, "notes": scan.notes},
+        f"wrote {out}: {counts} frames",
+        json,
+    )
+
+
+def simulate(
+    scene: Annotated[str, typer.Argument(help="A shipped scene's name or a TOML file.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Scan folder to write.")],
+    seed: Annotated[int, typer.Option(help="Of the noise; same seed, same scan.")] = 0,
+    overwrite: Force = False,
+    json: Json = False,
+) -> None:
+    """A phantom with known truth, recorded as a scan."""
+    from ..phantom import load_scene
+    from ..phantom import simulate as record
+
+    folder = record(load_scene(scene), out, seed=seed, overwrite=overwrite)
+    emit({"scan": folder, "seed": seed}, f"wrote {folder}", json)
