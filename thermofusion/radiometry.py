@@ -48,7 +48,7 @@ class Band:
             raise ValueError(f"a band from {self.lo_um} to {self.hi_um} µm is none")
 
     def integrate(self, T_K: ArrayLike) -> Float:
-        """In-band radiance by Gauss-Legendre quadrature, W m-2 sr-1, to rounding. For few values: `radiance` is fast."""
+        """In-band radiance by Gauss-Legendre quadrature, W m-2 sr-1, to rounding; `radiance` is fast."""
         lam, w = self._quadrature
         T = np.asarray(T_K, np.float64)
         return np.asarray(planck_radiance(lam, T[..., None]) @ w)
@@ -62,7 +62,7 @@ class Band:
         return _hermite(np.asarray(T_K, np.float64), *self._slope)
 
     def temperature_K(self, L: ArrayLike) -> Float:
-        """Inverse of `radiance`: the blackbody temperature, K, to 1e-6 K; NaN where no temperature of the table fits."""
+        """Inverse of `radiance`: blackbody temperature, K, to 1e-6 K; NaN outside 150-1500 K."""
         L = np.asarray(L, np.float64)
         with np.errstate(invalid="ignore", divide="ignore"):
             x = np.log(np.where(L > 0, L, np.nan))
@@ -206,7 +206,7 @@ def counts_to_kelvin(signal: SignalCurve, counts: Float) -> Float:
     try:
         with np.errstate(all="ignore"):
             if signal.curve == "polynomial":
-                return np.polynomial.polynomial.polyval(counts, p["coefficients_degC"]) + ZERO_DEGC_K
+                return np.asarray(np.polynomial.polynomial.polyval(counts, p["coefficients_degC"]) + ZERO_DEGC_K)
             if signal.curve == "linear_kelvin":
                 return np.asarray(p["gain_K"][0] * counts + p["offset_K"][0])
             if signal.curve == "planck":
@@ -217,7 +217,7 @@ def counts_to_kelvin(signal: SignalCurve, counts: Float) -> Float:
                 g, degC = np.asarray(p["counts"], np.float64), np.asarray(p["degC"], np.float64)
                 if len(g) < 2 or len(g) != len(degC) or not (np.diff(g) > 0).all():
                     raise ScanError("the table needs equally many rising counts and degC, at least two", place=place)
-                return np.interp(counts, g, degC, left=np.nan, right=np.nan) + ZERO_DEGC_K
+                return np.asarray(np.interp(counts, g, degC, left=np.nan, right=np.nan) + ZERO_DEGC_K)
     except (KeyError, IndexError) as e:
         raise ScanError(f"the '{signal.curve}' curve lacks its parameter {e}", place=place) from None
     raise ScanError(
@@ -228,7 +228,7 @@ def counts_to_kelvin(signal: SignalCurve, counts: Float) -> Float:
 def _longest_monotone(T_K: Float) -> tuple[int, int]:
     """First and last index of the longest stretch on which T is strictly monotone and inside the band's table."""
     with np.errstate(invalid="ignore"):
-        good = (T_K >= TABLE_K[0]) & (T_K <= TABLE_K[1])
+        good = (TABLE_K[0] <= T_K) & (TABLE_K[1] >= T_K)
         step = np.where(good[1:] & good[:-1], np.sign(np.diff(T_K)), 0)
     edges = np.flatnonzero(np.diff(step)) + 1
     starts, ends = np.r_[0, edges], np.r_[edges, len(step)]

@@ -111,8 +111,12 @@ class EmissivitySection(_Section):
     """ε(θ) of the surface."""
 
     model: Literal["dielectric", "non-dielectric", "cosine", "water", "tabulated", "fitted", "blackbody"] = "dielectric"
-    n: float = Field(1.33, gt=1, description="refractive index (dielectric, non-dielectric, fitted)")
-    k: float = Field(0.0, ge=0, description="extinction coefficient (non-dielectric, fitted)")
+    n: float | None = Field(
+        None, gt=1, description="refractive index; None = 1.33 (dielectric, non-dielectric) or 1.2233 (fitted: water)"
+    )
+    k: float | None = Field(
+        None, ge=0, description="extinction coefficient; None = 0.25 (non-dielectric) or 0.1304 (fitted: water)"
+    )
     epsilon0: float | None = Field(
         None, gt=0, le=1, description="emissivity straight on; scales the model's curve to it"
     )
