@@ -104,7 +104,7 @@ def surroundings(
 
 
 def _sample_vertices(mesh: SurfaceMesh, spacing_m: float) -> NDArray[np.int64]:
-    """One vertex, nearest its middle, of each occupied voxel and coarse normal direction (both sides of a thin part)."""
+    """One vertex, nearest its middle, of each voxel and coarse normal direction (both sides of a thin part)."""
     cell = np.floor(mesh.vertices_m / spacing_m).astype(np.int64)
     cell -= cell.min(0)
     side = np.abs(mesh.normals).argmax(1)
