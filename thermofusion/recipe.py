@@ -164,10 +164,12 @@ class CrosscalSection(_Section):
 class OutputSection(_Section):
     """What is written."""
 
-    formats: list[Literal["ply", "glb", "vtp"]] = ["ply", "glb", "vtp"]
+    formats: list[Literal["ply", "glb", "vtp", "csv"]] = ["ply", "glb", "vtp"]
     views: bool = Field(True, description="views/*.png")
     palette: Literal["inferno", "iron", "grey", "cividis", "rainbow"] = "inferno"
-    range_degC: tuple[float, float] | None = Field(None, description="colour range; None = 1st to 99th percentile")
+    range_degC: tuple[float, float] | None = Field(
+        None, description="colour range, low and high; None = 1st to 99th percentile"
+    )
 
 
 class QualitySection(_Section):
