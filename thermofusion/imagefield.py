@@ -1,0 +1,57 @@
+"""A low-order field over a thermal camera's image: vignetting, narcissus, warm housing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .types import Float, Int
+
+FIELD_ORDER = 4  # polynomial order
+
+
+@dataclass(frozen=True, eq=False)
+class ImageField:
+    """A low-order field φ(u, v) over the image: polynomials orthonormal over it, without a constant.
+
+    coefficients : (K,) W m-2 sr-1, each the rms over the image of its pattern; the mean over the image is zero (a
+    constant cannot be told from the views' offsets). exponents : (K+1, 2). mixing : (K+1, K) monomials -> patterns.
+    """
+
+    width_px: int
+    height_px: int
+    exponents: Int
+    mixing: Float
+    coefficients: Float
+
+    @classmethod
+    def zero(cls, width_px: int, height_px: int, order: int = FIELD_ORDER) -> ImageField:
+        """The field of an ideal camera."""
+        exponents = np.array([(i, n - i) for n in range(order + 1) for i in range(n + 1)], np.int32)
+        v, u = np.mgrid[0 : height_px - 1 : 40j, 0 : width_px - 1 : 40j]  # type: ignore[misc]
+        grid = _monomials(u.ravel(), v.ravel(), width_px, height_px, exponents)
+        q, r = np.linalg.qr(grid)
+        scale = np.sqrt(len(grid)) * np.sign(np.diag(r))
+        mixing = np.linalg.solve(r, np.eye(len(r)))[:, 1:] * scale[1:]
+        return cls(width_px, height_px, exponents, mixing, np.zeros(mixing.shape[1]))
+
+    def patterns(self, u_px: NDArray, v_px: NDArray) -> Float:
+        """(N, K) the patterns at pixels."""
+        return _monomials(u_px, v_px, self.width_px, self.height_px, self.exponents) @ self.mixing
+
+    def __call__(self, u_px: NDArray, v_px: NDArray) -> Float:
+        """φ at pixels (N,), W m-2 sr-1."""
+        return _monomials(u_px, v_px, self.width_px, self.height_px, self.exponents) @ (self.mixing @ self.coefficients)
+
+
+def _monomials(u_px: NDArray, v_px: NDArray, width_px: int, height_px: int, exponents: Int) -> Float:
+    x = (np.asarray(u_px, np.float64) - (width_px - 1) / 2) / (width_px / 2)
+    y = (np.asarray(v_px, np.float64) - (height_px - 1) / 2) / (width_px / 2)
+    order = int(exponents.max(initial=0))
+    powers_x, powers_y = [np.ones_like(x)], [np.ones_like(y)]
+    for _ in range(order):
+        powers_x.append(powers_x[-1] * x)
+        powers_y.append(powers_y[-1] * y)
+    return np.stack([powers_x[i] * powers_y[j] for i, j in exponents], axis=1)
