@@ -83,7 +83,9 @@ class FusionSection(_Section):
     voxel_mm: Literal["auto"] | float = Field(
         "auto", description="edge of a voxel; auto: from depth noise and thermal footprint"
     )
-    truncation_voxels: float = Field(6.0, gt=1, description="TSDF truncation in voxels")
+    truncation_voxels: Literal["auto"] | float = Field(
+        "auto", description="TSDF truncation in voxels; auto: 5 times the depth noise, at least 3 voxels"
+    )
     min_weight: float = Field(3.0, ge=0, description="surface seen by fewer depth frames is dropped")
     normal_window_mm: float = Field(
         25.0, gt=0, description="normals are averaged over this diameter (20-30 mm for Kinect)"

@@ -1,0 +1,180 @@
+"""Triangle meshes as plain arrays: order, pieces, floor, smoothing, normals. NumPy and SciPy, no Open3D, no files."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix, csr_matrix, diags
+from scipy.sparse.csgraph import connected_components
+
+from .types import Bool, Float, Float32, Int
+
+FLOOR_BAND_M = 0.012  # a vertex this near to a plane belongs to it: depth noise plus a floor's own unevenness
+FLOOR_NORMAL_COS = 0.94  # and its normal lies within 20° of the plane's
+FLOOR_BELOW_FRACTION = 0.02  # of the surface may lie under the floor (reflections in it, noise)
+FLOOR_MIN_AREA_M2 = 0.06  # less is no floor, rather the sole of a foot or a flat back
+FLOOR_MIN_SPREAD_M = 0.06  # standard deviation along the floor patch's narrow side
+FLOOR_HYPOTHESES = 400
+TAUBIN_SHRINK, TAUBIN_INFLATE = 0.5, -0.53  # low pass without shrinkage (Taubin 1995)
+
+
+def canonical(vertices: Float32, triangles: NDArray, merge_m: float) -> tuple[Float32, Int]:
+    """The same surface in an order that depends on its shape alone.
+
+    Marching cubes on a hash map deliver vertices in any order. Here vertices (V, 3) nearer than about `merge_m` are
+    merged, then sorted by z, y, x; triangles lose degenerate ones, start at their lowest vertex, and are sorted.
+    """
+    origin = vertices.min(0)
+    cells = np.rint((vertices - origin) / np.float32(merge_m)).astype(np.int64)
+    extent = cells.max(0) + 1
+    if float(extent[0]) * float(extent[1]) * float(extent[2]) >= 2**62:
+        raise ValueError("the surface is too large for its resolution")
+    key = (cells[:, 2] * extent[1] + cells[:, 1]) * extent[0] + cells[:, 0]
+    # Among vertices that fall together the smallest by coordinates represents them, whatever came first.
+    order = np.lexsort((vertices[:, 0], vertices[:, 1], vertices[:, 2], key))
+    first = np.ones(len(key), bool)
+    first[1:] = np.diff(key[order]) != 0
+    new = np.empty(len(key), np.int64)
+    new[order] = np.cumsum(first) - 1
+    out: Float32 = vertices[order[first]]
+    tri = new[triangles]
+    tri = tri[(tri[:, 0] != tri[:, 1]) & (tri[:, 1] != tri[:, 2]) & (tri[:, 2] != tri[:, 0])]
+    lead = tri.argmin(1)[:, None]
+    tri = np.take_along_axis(tri, (lead + np.arange(3)) % 3, axis=1)
+    tri = tri[np.lexsort((tri[:, 2], tri[:, 1], tri[:, 0]))]
+    return out, tri.astype(np.int32)
+
+
+def triangle_normals(vertices: Float32, triangles: Int) -> Float32:
+    """(F, 3) cross product of each triangle: outward, its length twice the area [m²]."""
+    a, b, c = (vertices[triangles[:, i]] for i in range(3))
+    return np.cross(b - a, c - a)
+
+
+def vertex_sums(values: NDArray, triangles: Int, count: int) -> Float:
+    """Sum over the triangles at each vertex: (F,) or (F, C) -> (count,) or (count, C)."""
+    columns = values.reshape(len(triangles), -1)
+    corners = triangles.ravel()
+    out: Float = np.stack([np.bincount(corners, np.repeat(c, 3).astype(np.float64), count) for c in columns.T], axis=1)
+    return out[:, 0] if values.ndim == 1 else out
+
+
+def vertex_areas(vertices: Float32, triangles: Int) -> Float:
+    """(V,) m²: a third of the area of the triangles at each vertex."""
+    return vertex_sums(np.linalg.norm(triangle_normals(vertices, triangles), axis=1) / 6, triangles, len(vertices))
+
+
+def components(triangles: Int, count: int) -> Int:
+    """(V,) number of the connected piece each vertex belongs to."""
+    edges = _edges(triangles)
+    graph = coo_matrix((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    return connected_components(graph, directed=False)[1].astype(np.int32)
+
+
+def keep_vertices(vertices: Float32, triangles: Int, keep: Bool) -> tuple[Float32, Int]:
+    """The triangles whose three vertices are all kept, and the vertices these use; order is preserved."""
+    tri = triangles[keep[triangles].all(1)]
+    used = np.zeros(len(vertices), bool)
+    used[tri] = True
+    new = np.cumsum(used, dtype=np.int32) - 1
+    return vertices[used], new[tri]
+
+
+def smooth_positions(vertices: Float32, triangles: Int, iterations: int) -> Float32:
+    """Taubin smoothing: `iterations` pairs of a shrinking and an inflating step. Vertices (V, 3) m."""
+    if iterations == 0:
+        return vertices
+    mean = _average(triangles, len(vertices), self_weight=0.0)
+    out = vertices
+    for _ in range(iterations):
+        for factor in (TAUBIN_SHRINK, TAUBIN_INFLATE):
+            out = out + np.float32(factor) * (mean @ out - out)
+    return out.astype(np.float32)
+
+
+def window_normals(vertices: Float32, triangles: Int, window_m: float) -> Float32:
+    """Unit outward normals (V, 3), averaged over a window of the given diameter on the surface.
+
+    Area-weighted triangle normals are diffused over the mesh graph (which never mixes a finger with its neighbour, as
+    a ball in space would) until they have spread as far as over a disc of that diameter: E[r²] = diameter²/8.
+    """
+    n = vertex_sums(triangle_normals(vertices, triangles), triangles, len(vertices)).astype(np.float32)
+    step = _average(triangles, len(vertices), self_weight=1.0)
+    edges = _edges(triangles)
+    length2 = ((vertices[edges[:, 0]] - vertices[edges[:, 1]]) ** 2).sum(1)
+    degree = np.bincount(edges.ravel(), minlength=len(vertices))
+    share = degree[edges] / (degree[edges] + 1.0)  # of a step's weight that leaves the vertex
+    spread2 = float((length2 * (share / degree[edges]).sum(1)).sum() / max(len(vertices), 1))
+    for _ in range(round(window_m**2 / 8 / max(spread2, 1e-12))):
+        n = step @ n
+    length = np.linalg.norm(n, axis=1, keepdims=True)
+    return np.divide(n, length, out=np.full_like(n, np.nan), where=length > 0)
+
+
+def _edges(triangles: Int) -> Int:
+    """(E, 2) undirected edges, each once."""
+    e = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    e.sort(axis=1)
+    key = np.unique(e[:, 0].astype(np.int64) << 32 | e[:, 1])
+    return np.stack([key >> 32, key & 0xFFFFFFFF], axis=1).astype(np.int32)
+
+
+def _average(triangles: Int, count: int, self_weight: float) -> csr_matrix:
+    """Sparse (V, V) float32 matrix that takes the mean over each vertex's neighbours and, with a weight, itself."""
+    e = _edges(triangles)
+    rows, cols = np.concatenate([e[:, 0], e[:, 1]]), np.concatenate([e[:, 1], e[:, 0]])
+    A = csr_matrix((np.ones(len(rows), np.float32), (rows, cols)), shape=(count, count))
+    A = A + diags(np.full(count, np.float32(self_weight)), format="csr", dtype=np.float32)
+    total = np.asarray(A.sum(1)).ravel()
+    return (diags(1 / np.maximum(total, 1e-12), dtype=np.float32) @ A).tocsr()
+
+
+# ---------------------------------------------------------------- the floor
+
+
+def find_floor(vertices: Float32, normals: Float32, areas: Float, eyes: Float, *, seed: int = 0) -> Float | None:
+    """The plane (4,) `[n, d]` that the subject stands (or lies) on, or None; n·p + d is the height above it [m].
+
+    A floor is a large flat patch with all of the surface, and every camera, on the side its normals point to: on a
+    body, which is convex nearly everywhere, the rest lies on the *other* side of a flat patch. RANSAC over single
+    vertices with their normals, then least squares over the inliers.
+
+    vertices, normals : (V, 3); areas : (V,) m²; eyes : (N, 3) camera centres.
+    """
+    if len(vertices) < 100:
+        return None
+    rng = np.random.default_rng(seed)
+    p = areas / areas.sum()
+    sample = rng.choice(len(vertices), min(6000, len(vertices)), p=p)  # area-uniform
+    X, N = vertices[sample].astype(np.float64), normals[sample].astype(np.float64)
+    best, best_share = None, 0.0
+    for i in rng.choice(len(sample), min(FLOOR_HYPOTHESES, len(sample)), replace=False):
+        height = (X - X[i]) @ N[i]
+        if (height < -3 * FLOOR_BAND_M).mean() > 3 * FLOOR_BELOW_FRACTION:
+            continue
+        share = float(((np.abs(height) < 2 * FLOOR_BAND_M) & (N @ N[i] > FLOOR_NORMAL_COS)).mean())
+        if share > best_share:
+            best, best_share = np.append(N[i], -N[i] @ X[i]), share
+    if best is None:
+        return None
+    return refine_floor(vertices, normals, areas, eyes, best)
+
+
+def refine_floor(vertices: Float32, normals: Float32, areas: Float, eyes: Float, plane: Float) -> Float | None:
+    """Least-squares plane through the vertices near `plane` (4,), or None if they make no floor (see `find_floor`)."""
+    X = vertices.astype(np.float64)
+    for band in (2 * FLOOR_BAND_M, FLOOR_BAND_M, FLOOR_BAND_M):
+        height = X @ plane[:3] + plane[3]
+        on = (np.abs(height) < band) & (normals @ plane[:3].astype(np.float32) > FLOOR_NORMAL_COS)
+        if on.sum() < 50:
+            return None
+        w = areas[on] / areas[on].sum()
+        centre = w @ X[on]
+        spread, axes = np.linalg.eigh((X[on] - centre).T @ ((X[on] - centre) * w[:, None]))
+        n = axes[:, 0] * np.sign(axes[:, 0] @ plane[:3])
+        plane = np.append(n, -n @ centre)
+    height = X @ plane[:3] + plane[3]
+    below = areas[height < -2 * FLOOR_BAND_M].sum() / areas.sum()
+    large = areas[on].sum() > FLOOR_MIN_AREA_M2 and np.sqrt(max(spread[1], 0)) > FLOOR_MIN_SPREAD_M
+    cameras_above = (eyes @ plane[:3] + plane[3] > 0.1).all()
+    return plane if large and cameras_above and below < FLOOR_BELOW_FRACTION else None
