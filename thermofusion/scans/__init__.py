@@ -1,22 +1,99 @@
-"""Recordings: one reader per format, all presenting the same `Scan`."""
+"""Recordings: one reader per format, all presenting the same `Scan`.
+
+`FORMATS` is the table of readers; docs/adding-a-reader.md says how to add one.
+"""
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 
-from ..errors import ScanError
+from ..errors import RecipeError, ScanError
 from ..types import Scan
+from .compose import with_rig, with_thermal
 from .native import is_native, read_native
 
 
+@dataclass(frozen=True)
+class Format:
+    """A kind of recording.
+
+    name : what `--format` calls it. recognise : looks at file names only, quick, never raises. read : path -> Scan,
+    raises ScanError. what : one line for people.
+    """
+
+    name: str
+    recognise: Callable[[Path], bool]
+    read: Callable[[Path], Scan]
+    what: str
+
+
+def _late(module: str, function: str) -> Callable:
+    """A function of a reader's module, imported when it is called: --help stays fast."""
+
+    def call(path: Path) -> object:
+        return getattr(import_module(f".{module}", __name__), function)(path)
+
+    return call
+
+
+def _reader(name: str, module: str, what: str) -> Format:
+    return Format(name, _late(module, "recognise"), _late(module, "read"), what)
+
+
+# In the order of recognition: the more particular layouts first.
+FORMATS: tuple[Format, ...] = (
+    Format("native", is_native, read_native, "thermofusion's own folder: scan.json + frames.csv + images"),
+    _reader("azure-mkv", "azure", "Azure Kinect recording (.mkv), without the vendor's library"),
+    _reader("realsense-bag", "realsense", "RealSense recording (.bag), through Open3D"),
+    _reader("flir", "flir", "FLIR radiometric JPEG or SEQ: thermal frames only, to be joined to a depth recording"),
+    _reader("fakenect", "fakenect", "Kinect v1 recording of libfreenect's fakenect-record (INDEX.txt)"),
+    _reader("tum", "tum", "TUM RGB-D benchmark folder (rgb.txt, depth.txt, groundtruth.txt)"),
+    _reader("apc-shelf", "apcshelf", "Princeton shelf&tote folder (cam.info.txt, bit-rotated depth)"),
+    _reader("7-scenes", "sevenscenes", "7-Scenes / 3DMatch folder (frame-NNNNNN.{color,depth,pose})"),
+    _reader("jhu", "jhu", "laboratory layout of the paper: .pgm depth and _0000.raw thermal counts"),
+    _reader("redwood", "redwood", "Redwood / Open3D folder (color/ + depth/, camera_intrinsic.json)"),
+)
+
+
 def open_scan(path: str | Path, *, format: str | None = None) -> Scan:
-    """Open a recording of any known format (recognised by its files, or named by `format`)."""
+    """Open a recording of any known format (recognised by its files, or named by `format`).
+
+    A `rig.json` beside the recording's files replaces the cameras and extrinsics that a foreign format cannot carry
+    or that its reader had to assume. What was assumed stands in `Scan.notes`.
+
+    Raises ScanError: no such path, no format recognises it, or the recording is faulty; RecipeError: unknown format.
+    """
     root = Path(path)
-    if not root.exists():
+    try:
+        there = root.exists()
+    except (OSError, ValueError):
+        there = False
+    if not there:
         raise ScanError("there is no such scan", place=root)
-    if is_native(root):
-        return read_native(root)
-    raise ScanError("no known recording format was recognised here", place=root)
+    known = find_format(format) if format else next((f for f in FORMATS if f.recognise(root)), None)
+    if known is None:
+        raise ScanError(
+            "no known recording format was recognised here",
+            place=root,
+            hint=f"name one with --format: {', '.join(f.name for f in FORMATS)}",
+        )
+    scan = known.read(root)
+    rig = (root if root.is_dir() else root.parent) / "rig.json"
+    return with_rig(scan, rig) if known.name != "native" and rig.is_file() else scan
 
 
-__all__ = ["open_scan"]
+def find_format(name: str) -> Format:
+    """The format of that name; RecipeError (usage) with the nearest match for an unknown one."""
+    names = [f.name for f in FORMATS]
+    if name not in names:
+        near = difflib.get_close_matches(name, names, n=1, cutoff=0.4)
+        hint = f"did you mean '{near[0]}'?" if near else None
+        raise RecipeError(f"there is no format '{name}', known are {', '.join(names)}", hint=hint)
+    return FORMATS[names.index(name)]
+
+
+__all__ = ["FORMATS", "Format", "find_format", "open_scan", "with_rig", "with_thermal"]

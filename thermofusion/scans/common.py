@@ -20,6 +20,7 @@ from .files import claimed_size, decode_image, depth_from_raw, read_bytes, read_
 Kind = Literal["depth", "color", "thermal"]
 ASSUMED_RATE_HZ = 30.0  # of recordings that carry no times
 MAX_POSITION_M = 1000.0  # a pose farther from the origin is in other units than metres
+POSE_TOLERANCE = 1e-2  # deviation of RᵀR from identity in a recorded pose
 # A Kinect v1 / PrimeSense camera whose calibration nobody recorded (Open3D's and OpenNI's default).
 NOMINAL_K = np.array([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]])
 
@@ -158,15 +159,27 @@ def make_rig(
 
 
 def poses_to_trajectory(times_s: NDArray, poses: NDArray, *, place: object) -> Trajectory:
-    """(N, 4, 4) T_world_depth with their times; each must be a rigid transform in metres."""
+    """(N, 4, 4) T_world_depth in metres with their times; rotations are made exactly orthonormal.
+
+    Raises ScanError for a pose that is no rigid transform to `POSE_TOLERANCE`.
+    """
     try:
-        T = np.stack([check_rigid(M, f"pose {i}") for i, M in enumerate(poses)])
+        T = np.stack([_nearest_rigid(M, f"pose {i}") for i, M in enumerate(poses)])
         trajectory = Trajectory(times_s, T)
     except ValueError as e:
         raise ScanError(str(e), place=place) from None
     if np.abs(T[:, :3, 3]).max() > MAX_POSITION_M:
         raise ScanError(f"a pose lies more than {MAX_POSITION_M:.0f} m from the origin, expected metres", place=place)
     return trajectory
+
+
+def _nearest_rigid(M: NDArray, name: str) -> Float:
+    """The rigid transform nearest to a rounded one: published poses are off by up to a few 1e-3."""
+    R = M[:3, :3]
+    if np.isfinite(R).all() and np.abs(R.T @ R - np.eye(3)).max() <= POSE_TOLERANCE and np.linalg.det(R) > 0:
+        U, _, Vt = np.linalg.svd(R)
+        M = np.block([[U @ Vt, M[:3, 3:]], [M[3:]]])
+    return check_rigid(M, name)
 
 
 def read_tum_trajectory(path: Path) -> Trajectory:

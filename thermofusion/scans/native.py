@@ -83,7 +83,7 @@ def _read_frames(root: Path, rig: Rig, unit_m: float) -> dict[str, Stream]:
         raise ScanError(f"column(s) {', '.join(sorted(missing))} are missing", place=path)
 
     rows = [_row(root, row, f"{path}, line {number}") for number, row in enumerate(table, 2)]
-    streams = {}
+    streams: dict[str, Stream] = {}
     for kind in STREAMS:
         camera: Camera | None = getattr(rig, kind)
         own = [r for r in rows if r.stream == kind]
