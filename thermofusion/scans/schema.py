@@ -17,10 +17,14 @@ STREAMS: tuple[Kind, ...] = ("depth", "color", "thermal")
 
 
 class Border(BaseModel):
+    """A group of the schema: unknown keys are kept, infinities refused."""
+
     model_config = ConfigDict(extra="allow", allow_inf_nan=False)
 
 
 class CurveDoc(Border):
+    """`signal.curve`: counts to temperature."""
+
     type: Literal["polynomial", "linear_kelvin", "planck", "table"]
     coefficients_degC: list[float] | None = None
     gain_K: float | None = None
@@ -34,11 +38,15 @@ class CurveDoc(Border):
 
 
 class SignalDoc(Border):
+    """`signal`: what a stored thermal pixel is."""
+
     kind: Literal["counts", "apparent_degC", "radiance"]
     curve: CurveDoc | None = None
 
 
 class CameraDoc(Border):
+    """A camera."""
+
     width_px: int = Field(gt=0, le=32767)
     height_px: int = Field(gt=0, le=32767)
     K: list[list[float]]
@@ -48,10 +56,14 @@ class CameraDoc(Border):
 
 
 class DepthCameraDoc(CameraDoc):
+    """The depth camera."""
+
     depth_unit_m: float = Field(0.001, gt=1e-6, le=0.1)
 
 
 class ThermalCameraDoc(CameraDoc):
+    """The thermal camera."""
+
     signal: SignalDoc
     band_um: tuple[float, float] = (7.5, 13.5)
     netd_K: float = Field(0.05, gt=0)
@@ -60,23 +72,31 @@ class ThermalCameraDoc(CameraDoc):
 
 
 class CamerasDoc(Border):
+    """`cameras` of a scan."""
+
     depth: DepthCameraDoc
     color: CameraDoc | None = None
     thermal: ThermalCameraDoc | None = None
 
 
 class ExtrinsicsDoc(Border):
+    """`extrinsics`: where the cameras sit."""
+
     T_color_depth: list[list[float]] | None = None
     T_thermal_depth: list[list[float]] | None = None
 
 
 class EnvironmentDoc(Border):
+    """`environment`: the room."""
+
     reflected_degC: float | None = Field(None, gt=-100, lt=200)
     air_degC: float | None = Field(None, gt=-100, lt=200)
     relative_humidity_pct: float | None = Field(None, ge=0, le=100)
 
 
 class BlackbodyDoc(Border):
+    """A source of known temperature in some thermal frames."""
+
     kind: Literal["blackbody"]
     degC: float = Field(gt=-100, lt=1000)
     uncertainty_K: float = Field(ge=0)
@@ -86,6 +106,8 @@ class BlackbodyDoc(Border):
 
 
 class ContactDoc(Border):
+    """A thermometer on the skin."""
+
     kind: Literal["contact"]
     degC: float = Field(gt=-100, lt=1000)
     uncertainty_K: float = Field(ge=0)
@@ -93,6 +115,8 @@ class ContactDoc(Border):
 
 
 class ScanDoc(Border):
+    """scan.json."""
+
     schema_: Literal["thermofusion-scan/1"] = Field(alias="schema")
     name: str = "scan"
     recorded_at: str | None = None
@@ -105,6 +129,8 @@ class ScanDoc(Border):
 
 
 class RigCamerasDoc(Border):
+    """`cameras` of a rig.json, each optional."""
+
     depth: DepthCameraDoc | None = None
     color: CameraDoc | None = None
     thermal: ThermalCameraDoc | None = None
