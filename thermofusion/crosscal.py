@@ -5,14 +5,14 @@ reflects, an observation of it by view i at pixel (u, v) is
 
     L = L_r + (E(θ) + s·D(θ))·x_v + b_i + φ(u, v) + γ·(L - L_pivot) + noise,      E = ε(θ)/ε(0),
 
-so that ε(0) plays no part. All x_v are eliminated, which leaves a small system: views + field + shape, whatever the size
-of the mesh. The common level is no matter of overlap: it is imposed as a hard constraint (a blackbody, a contact
+so that ε(0) plays no part. All x_v are eliminated, which leaves a small system: views + field + shape, whatever the
+size of the mesh. The common level is no matter of overlap: it is imposed as a hard constraint (a blackbody, a contact
 thermometer, else Σ b = 0 and the result is relative). See docs/radiometry.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,14 +20,14 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from .emissivity import EmissivityModel, Reshaped, shape_direction
+from .emissivity import AngleTable, EmissivityModel, reshaped, shape_direction
 from .errors import ScanError
 from .imagefield import ImageField
 from .radiometry import Band
 from .recipe import CrosscalSection
 from .references import BlackbodyReading, ContactReading
 from .types import Bool, Float, Float32, Int, Observations
-from .uncertainty import AngleTables, ErrorModel, observation_variance, skin_slope
+from .uncertainty import AngleTables, ErrorModel, covariance_modes, observation_variance, skin_slope
 
 TUKEY = 4.685  # 95 % efficient for normal errors
 HUBER = 1.345
@@ -65,6 +65,7 @@ class CrosscalResult:
     covariance: Float
     slope_L: float
     anchored: bool
+    reference_sigma_K: float
     level_sigma_K: float
     residual_sigma: float
     view_rms_K: Float
@@ -90,9 +91,27 @@ class CrosscalResult:
             out = (out + np.float32((self.gain - 1) * self.pivot_radiance)) / np.float32(self.gain)
         return np.asarray(out, np.float32)
 
+    def error_modes(self, count: int) -> Callable[[Observations, NDArray], Float32]:
+        """How the strongest error modes of this calibration shift observations: (rows, x of rows) -> (N, count)."""
+        modes = covariance_modes(self.covariance, count).astype(np.float32)
+        M = len(self.offset_radiance)
+        direction = AngleTable.of(shape_direction(AngleTable.knots()))
+        cells = 32  # the field is smooth: a coarse raster of it does for an error
+        v, u = np.mgrid[0:cells, 0:cells]
+        du, dv = self.field.width_px / cells, self.field.height_px / cells
+        raster = (self.field.patterns((u.ravel() + 0.5) * du, (v.ravel() + 0.5) * dv) @ modes[M:-2]).astype(np.float32)
+
+        def effect(rows: Observations, x: NDArray) -> Float32:
+            cell = (rows.v_px / dv).astype(np.int32) * cells + (rows.u_px / du).astype(np.int32)
+            out = modes[rows.view] + raster[np.clip(cell, 0, cells * cells - 1)]
+            bent = (x * direction(rows.cos_angle)).astype(np.float32)
+            return np.asarray(out + bent[:, None] * modes[-2], np.float32)
+
+        return effect
+
     def emissivity(self, model: EmissivityModel) -> EmissivityModel:
-        """The model with the fitted shape."""
-        return Reshaped(model, self.shape) if self.shape else model
+        """The model with the fitted shape (and its ε(0), see `emissivity.reshaped`)."""
+        return reshaped(model, self.shape)
 
 
 def cross_calibrate(
@@ -167,6 +186,7 @@ class _Solution:
     weight: Float  # of observations, robust part included
     scale: float  # of standardised residuals
     level_gain: Float  # dp / d(level constraint)
+    level_variance: float  # of that constraint
     iterations: int
     converged: bool
 
@@ -292,8 +312,8 @@ class _Problem:
                 x = self._medians(p, 1 / self.sigma2)
             weight, scale = self._robust(p, x, huber=n < HUBER_STEPS)
         assert out is not None
-        covariance, normal, level_gain = out
-        return _Solution(p, x, covariance * scale**2, normal, weight, scale, level_gain, n, converged)
+        covariance, normal, level_gain, level_variance = out
+        return _Solution(p, x, covariance * scale**2, normal, weight, scale, level_gain, level_variance, n, converged)
 
     def _predict(self, p: Float, x: Float) -> Float:
         """Model of y at all observations."""
@@ -327,8 +347,8 @@ class _Problem:
         half = np.searchsorted(w, 0.5 * (begin + total))
         return np.asarray(value[order][np.minimum(half, ends)])
 
-    def _step(self, p: Float, x: Float, w: Float) -> tuple[Float, Float, tuple[Float, Float, Float]]:
-        """One Gauss-Newton step with x eliminated: (p, x, (covariance, normal matrix, level gain))."""
+    def _step(self, p: Float, x: Float, w: Float) -> tuple[Float, Float, tuple[Float, Float, Float, float]]:
+        """One Gauss-Newton step with x eliminated: (p, x, (covariance, normal matrix, level gain and variance))."""
         M, K, P = self._size
         s = p[M + K]
         E = self.E + s * self.D
@@ -361,9 +381,8 @@ class _Problem:
         row, target, row_variance = self._level(a, c, B, N, rhs)
         p_new, covariance, level_gain = _constrained(N, rhs, row, target)
         p_new[M + K] = np.clip(p_new[M + K], *SHAPE_BOUNDS)
-        covariance = covariance + row_variance * np.outer(level_gain, level_gain)
         x_new = (c - B @ p_new) / a
-        return p_new, x_new, (covariance, N, level_gain)
+        return p_new, x_new, (covariance, N, level_gain, row_variance)
 
     def _add_priors(self, N: Float, rhs: Float) -> None:
         """Weak knowledge that only matters where the overlap has none; never on the common level."""
@@ -465,6 +484,7 @@ class _Problem:
             covariance=covariance,
             slope_L=self.slope_L,
             anchored=self.anchored,
+            reference_sigma_K=np.sqrt(solution.level_variance) / self.slope_L if self.anchored else float("nan"),
             level_sigma_K=self._level_sigma_K(solution),
             residual_sigma=solution.scale,
             view_rms_K=view_rms,
@@ -484,7 +504,8 @@ class _Problem:
         g = np.zeros(P)
         g[:M] = (self.by_view @ solution.weight) / solution.weight.sum()
         g[M : M + K] = (solution.weight @ self.patterns) / solution.weight.sum()
-        return float(np.sqrt(g @ solution.covariance @ g) / self.slope_L)
+        variance = g @ solution.covariance @ g + solution.level_variance
+        return float(np.sqrt(variance) / self.slope_L)
 
     def _messages(self, solution: _Solution) -> tuple[str, ...]:
         out = []

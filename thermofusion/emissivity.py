@@ -176,16 +176,38 @@ class Scaled(EmissivityModel):
 class Reshaped(EmissivityModel):
     """A model whose shape was fitted: ε(0)·(E(θ) + s·D(θ)), D = `shape_direction`.
 
-    One parameter carries the skin presets into each other: s = +1 turns n = 1.33 into 1.33 + 0.25i, s ≈ -0.24 into
-    water (docs/radiometry.md). E is kept in (0, 1].
+    One parameter carries the skin presets into each other: s = +1 turns n = 1.33 into 1.33 + 0.25i, s ≈ -0.25 into
+    water, with 1-2 mK left up to 65° (docs/radiometry.md). E is kept positive and ε at most 1.
     """
 
     model: EmissivityModel
     s: float
+    epsilon0: float
 
     def __call__(self, cos_theta: ArrayLike) -> Float:
         E = self.model.relative(cos_theta) + self.s * shape_direction(cos_theta)
-        return np.asarray(self.model.normal * np.clip(E, 1e-3, 1 / self.model.normal))
+        return np.asarray(self.epsilon0 * np.clip(E, 1e-3, 1 / self.epsilon0))
+
+
+def reshaped(model: EmissivityModel, s: float) -> EmissivityModel:
+    """A model with a fitted shape s.
+
+    Overlap sees E(θ) = ε(θ)/ε(0) only. For a smooth surface, though, both follow from one n + ik, and ε(0) moves along
+    with the shape as it does between the skin presets: by -0.011·s, right to 0.004 for anything from n = 1.2 to water
+    to 1.33 + 0.25i. So ε(0) follows where the model is such a surface; where it was declared (`Scaled`, a table), and
+    far from skin, it stays.
+    """
+    if not s:
+        return model
+    epsilon0 = model.normal
+    if follows_shape(model):
+        epsilon0 = float(np.clip(epsilon0 + s * (Fresnel(1.33, 0.25).normal - Fresnel(1.33).normal), 0.5, 1.0))
+    return Reshaped(model, s, epsilon0)
+
+
+def follows_shape(model: EmissivityModel) -> bool:
+    """Whether ε(0) follows a fitted shape: a smooth surface like skin whose ε(0) was not declared."""
+    return isinstance(model, Fresnel | Spectral) and model.normal > 0.9
 
 
 def shape_direction(cos_theta: ArrayLike) -> Float:

@@ -30,9 +30,9 @@ class ImageField:
     def zero(cls, width_px: int, height_px: int, order: int = FIELD_ORDER) -> ImageField:
         """The field of an ideal camera."""
         exponents = np.array([(i, n - i) for n in range(order + 1) for i in range(n + 1)], np.int32)
-        v, u = np.mgrid[0 : height_px - 1 : 40j, 0 : width_px - 1 : 40j]  # type: ignore[misc]
+        v, u = np.mgrid[0 : height_px - 1 : 40j, 0 : width_px - 1 : 40j]
         grid = _monomials(u.ravel(), v.ravel(), width_px, height_px, exponents)
-        q, r = np.linalg.qr(grid)
+        r = np.linalg.qr(grid, mode="r")
         scale = np.sqrt(len(grid)) * np.sign(np.diag(r))
         mixing = np.linalg.solve(r, np.eye(len(r)))[:, 1:] * scale[1:]
         return cls(width_px, height_px, exponents, mixing, np.zeros(mixing.shape[1]))

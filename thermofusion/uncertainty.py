@@ -22,9 +22,10 @@ MAX_LEVER = 4.0  # bound on a normal error's lever near grazing, where the linea
 class ErrorModel:
     """One-sigma errors of what an observation depends on.
 
-    netd_K : noise of a pixel. sigma_normal_deg : of the surface normal. sigma_shape : relative, of 1-E(θ).
-    sigma_registration_px : of the thermal image on the surface. sigma_reflected_K : of the room's reflected temperature.
-    gradient_K_per_m : temperature gradient along the surface, scalar or (V,).
+    netd_K : noise of a pixel. sigma_normal_deg : of the surface normal, per axis. sigma_shape : relative, of 1-E(θ),
+    where it is not fitted. sigma_registration_px : of the thermal image on the surface. sigma_reflected_K : of the
+    room's reflected temperature. gradient_K_per_m : temperature gradient along the surface, scalar or (V,).
+    sigma_emissivity0 : of ε(0).
     """
 
     netd_K: float = 0.05
@@ -33,6 +34,7 @@ class ErrorModel:
     sigma_registration_px: float = 0.5
     sigma_reflected_K: float = 1.0
     gradient_K_per_m: float | Float32 = 0.0
+    sigma_emissivity0: float = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,4 +91,107 @@ def skin_slope(band: Band, radiance: NDArray) -> float:
     return float(band.d_radiance_dT(T if np.isfinite(T) else 306.15))
 
 
-__all__ = ["AngleTables", "ErrorModel", "Float", "observation_variance", "registration_m", "skin_slope"]
+# ---------------------------------------------------------------- per vertex
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """One sigma per vertex, K, and its parts (V,) float32; total² = Σ parts². NaN = unmeasured.
+
+    noise : of the pixels. calibration : offsets and field of the views. shape : of ε(θ). emissivity0 : ε(0), absolute
+    only. reference : what set the level (0 for a relative result: its level is unknown). reflected : T_refl. normals :
+    of the surface. registration : thermal image on a temperature gradient. air : the air path. views : how far views
+    disagree, for methods that do not calibrate them.
+    """
+
+    total_K: Float32
+    parts_K: dict[str, Float32]
+
+    @classmethod
+    def of(cls, parts_K: dict[str, NDArray]) -> Uncertainty:
+        parts = {name: np.asarray(value, np.float32) for name, value in parts_K.items()}
+        total = np.sqrt(np.sum([p.astype(np.float64) ** 2 for p in parts.values()], axis=0))
+        return cls(total.astype(np.float32), parts)
+
+
+@dataclass(frozen=True, eq=False)
+class Levers:
+    """How errors of observations reach a vertex: x = Σ h·(L - L_r), with h = wE/ΣwE² in each row.
+
+    All sums run over a vertex's rows, (V,). squared : Σh². total : Σh. loss : Σ h(1-E). slope, slope_squared : Σ h|E'|
+    and Σ (hE')². registration_m : Σ h·m. modes : (V, R) effect of each mode of the calibration's covariance.
+    """
+
+    squared: Float
+    total: Float
+    loss: Float
+    slope: Float
+    slope_squared: Float
+    registration_m: Float
+    modes: Float
+
+
+def vertex_uncertainty(
+    levers: Levers,
+    x: Float,
+    T_K: Float,
+    *,
+    epsilon0: float,
+    absolute: bool,
+    slope_L: float,
+    slope_reflected: float,
+    errors: ErrorModel,
+    shape_fitted: bool,
+    epsilon0_follows: bool,
+    reference_sigma_K: float,
+    air_K: float | None,
+    transmission_per_m: float,
+    range_m: NDArray,
+    views_K: NDArray | None,
+) -> Uncertainty:
+    """One sigma of each vertex with its parts, K (docs/radiometry.md, error budget).
+
+    x : (V,) normal-equivalent excess. absolute : the output is divided by ε(0), else normal-equivalent.
+    """
+    scale = 1 / (slope_L * (epsilon0 if absolute else 1.0))  # radiance of x -> K of the output
+    zero = np.zeros(len(x))
+    normal = np.radians(errors.sigma_normal_deg)
+    # An error of a normal tilts the surface to some views and away from others: between coherent and independent.
+    tilt = np.sqrt(0.5 * (levers.slope**2 + levers.slope_squared))
+    reflected = 1 - levers.total / (epsilon0 if absolute else 1.0)  # dL_s/dL_r
+    sigma_epsilon0 = (
+        min(errors.sigma_emissivity0, LINKED_EPSILON0_SIGMA) if epsilon0_follows else errors.sigma_emissivity0
+    )
+    # The level comes from a reference (or is relative), so only the path's differences count; a corrected path is taken
+    # to be right to a third of itself.
+    air_loss = AIR_LOSS_PER_M if transmission_per_m == 1 else (1 - transmission_per_m) / 3
+    path = np.abs(range_m - np.nanmedian(range_m)) if np.isfinite(range_m).any() else zero
+    parts = {
+        "noise": scale * errors.netd_K * slope_L * np.sqrt(BILINEAR_VARIANCE * levers.squared),
+        "calibration": scale * np.sqrt((levers.modes**2).sum(1)),
+        "shape": zero if shape_fitted else scale * np.abs(x * levers.loss) * errors.sigma_shape,
+        "emissivity0": scale * np.abs(x) / epsilon0 * sigma_epsilon0 if absolute else zero,
+        "reference": zero
+        + (reference_sigma_K / (epsilon0 if absolute else 1.0) if np.isfinite(reference_sigma_K) else 0),
+        "reflected": np.abs(reflected) * errors.sigma_reflected_K * slope_reflected / slope_L,
+        "normals": scale * np.abs(x) * tilt * normal,
+        "registration": np.asarray(errors.gradient_K_per_m) * levers.registration_m,
+        "air": zero if air_K is None else np.abs(T_K - air_K) * air_loss * path,
+        "views": zero if views_K is None else np.nan_to_num(views_K),
+    }
+    unmeasured = ~np.isfinite(T_K)
+    return Uncertainty.of(
+        {k: np.where(unmeasured, np.nan, v) for k, v in parts.items() if k != "views" or views_K is not None}
+    )
+
+
+def covariance_modes(covariance: Float, count: int) -> Float:
+    """(P, R) vectors whose outer products add up to the `count` strongest modes of a covariance (P, P)."""
+    values, vectors = np.linalg.eigh(covariance)
+    top = np.argsort(values)[::-1][:count]
+    return np.asarray(vectors[:, top] * np.sqrt(np.maximum(values[top], 0)))
+
+
+BILINEAR_VARIANCE = 4 / 9  # mean over sub-pixel positions of the noise variance left by bilinear sampling
+AIR_LOSS_PER_M = 0.006  # 1-τ of a metre of room air at 50 % humidity, 7.5-13.5 µm (62 mK at 10 K contrast)
+LINKED_EPSILON0_SIGMA = 0.003  # of ε(0) where it follows the fitted shape of a smooth surface
