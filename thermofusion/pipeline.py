@@ -13,8 +13,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from . import __version__
 from .check import verify
 from .errors import RecipeError, ScanError
@@ -106,14 +104,17 @@ def fuse(
     surface = run("surface", lambda p: fuse_surface(scan, trajectory, recipe, floor_plane=tracking.floor_plane))
     alignment = seen = temperature = None
     if surface is not None and scan.thermal is None:
-        temperature = unmeasured(scan, surface.mesh, recipe)
+        temperature = unmeasured(scan, surface.mesh, recipe, trajectory)
     elif surface is not None:
         # 2. Rig
         alignment = run("align", lambda p: align_thermal(scan, surface.mesh, trajectory, recipe))
         # 3. Mapping
         seen = run("observe", lambda p: see(scan, surface.mesh, trajectory, alignment, recipe))
         # 4. Temperature
-        temperature = run("temperature", lambda p: measure(scan, surface.mesh, seen, recipe, compare=compare_methods))
+        temperature = run(
+            "temperature",
+            lambda p: measure(scan, surface.mesh, seen, recipe, trajectory=trajectory, compare=compare_methods),
+        )
 
     report = result_report(scan, recipe, tracking, surface, alignment, seen, temperature, stages.reused)
     result = Result(report, trajectory, tracking, surface, alignment, seen, temperature)
@@ -143,7 +144,7 @@ def plan(scan: Scan, recipe: Recipe, out: Path, *, redo_from: str | None = None)
 
 
 def write_result(result: Result, recipe: Recipe, folder: Path) -> None:
-    """The result folder's files (docs/formats.md), each whole or not at all; `result.json` last: it says all is there."""
+    """The result folder's files (docs/formats.md), each whole or not at all; `result.json` comes last."""
     from .export import export, write_trajectory
     from .pictures import write_views
 
