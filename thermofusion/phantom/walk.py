@@ -93,7 +93,7 @@ class Motion:
         T = np.tile(np.eye(4), (len(times_s), 1, 1))
         if self.walk.subject_turns:
             angle = -2 * np.pi * self.walk.turns * times_s / self.duration_s
-            T[:, :3, :3] = Rotation.from_euler("z", angle).as_matrix()
+            T[:, :3, :3] = Rotation.from_euler("z", angle[:, None]).as_matrix()
         return T
 
     def breath_m(self, times_s: Float) -> Float:
