@@ -216,9 +216,11 @@ def _candidates(mesh: Mesh, camera: Camera, shape: tuple[int, int], T_body_camer
 
 def room_distance(room: RoomConfig, rays: Float, T_world_camera: Float) -> tuple[Float32, Bool]:
     """Depth z (sH, sW) of floor and round wall, inf = open space; and which samples see the floor."""
+    z, floor = np.full(rays.shape[:2], np.inf), np.zeros(rays.shape[:2], bool)
+    if room.wall_radius_m is None and not room.floor:
+        return z.astype(np.float32), floor
     d = rays @ T_world_camera[:3, :3].T
     eye = T_world_camera[:3, 3]
-    z = np.full(rays.shape[:2], np.inf)
     with np.errstate(divide="ignore", invalid="ignore"):
         if room.wall_radius_m is not None:
             a, b = (d[..., :2] ** 2).sum(-1), (d[..., :2] * eye[:2]).sum(-1)
@@ -226,7 +228,6 @@ def room_distance(room: RoomConfig, rays: Float, T_world_camera: Float) -> tuple
             z = (-b + np.sqrt(np.maximum(b * b - a * inside, 0))) / a
         floor_z = np.where(d[..., 2] < 0, -eye[2] / d[..., 2], np.inf)
         radius = np.linalg.norm(eye[:2] + floor_z[..., None] * d[..., :2], axis=-1)
-    floor = np.zeros(z.shape, bool)
     if room.floor:
         floor = np.isfinite(floor_z) & (floor_z < z) & (radius < room.floor_radius_m)
         z = np.where(floor, floor_z, z)
@@ -320,6 +321,6 @@ class Texture:
         """Reflectance (N, 3) in linear R, G, B."""
         waves = np.cos(points_m @ self.wave + self.phase)
         blotch, freckle = waves[:, :12].sum(1) / np.sqrt(6), waves[:, 12:].sum(1) / np.sqrt(6)
-        shade = 1 + 0.08 * blotch + 0.04 * freckle - 0.12 * np.clip(freckle - 1.2, 0, 1.0)
-        redness = 1 + np.stack([0.03 * blotch, -0.03 * blotch, -0.02 * blotch], 1)
+        shade = 1 + 0.05 * blotch + 0.04 * freckle - 0.12 * np.clip(freckle - 1.2, 0, 1.0)
+        redness = 1 + np.stack([0.02 * blotch, -0.02 * blotch, -0.02 * blotch], 1)
         return SKIN_RGB * np.clip(shade, 0.3, 1.4)[:, None] * redness

@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.interpolate import PchipInterpolator
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
@@ -160,7 +161,7 @@ def _mannequin(edge_m: float) -> tuple[Float, NDArray]:
     # even along the outline, so that the flat ends get triangles of the same size
     s = np.concatenate([[0], np.cumsum(np.hypot(np.diff(wide), np.diff(z)))])
     at = np.linspace(0, s[-1], int(s[-1] / edge_m) + n // 8)
-    z_i, a_i, b_i = (np.interp(at, s, q) for q in (z, wide, deep))
+    z_i, a_i, b_i = (PchipInterpolator(s, q)(at) for q in (z, wide, deep))
     t = np.linspace(0, 2 * np.pi, max(int(1.0 / edge_m), 48), endpoint=False)
     power = 0.8  # between ellipse (1) and box (0)
     x = np.sign(np.cos(t)) * np.abs(np.cos(t)) ** power
