@@ -21,7 +21,7 @@ from .types import Camera, Float, Scan, Stream, UInt8
 
 DEPTH_RANGE_M = (0.15, 9.0)  # a room's median depth lies inside, whatever the camera; outside, the unit is wrong
 BODY_RANGE_M = (0.3, 4.5)  # where a body scan's median depth is expected
-APPARENT_RANGE_DEGC = (-40.0, 150.0)  # a thermal frame's median lies inside
+APPARENT_RANGE_DEGC = (-10.0, 80.0)  # the median of a frame with a body, or a phantom, in a room lies inside
 MAX_BASELINE_M, MAX_ANGLE_DEG = 0.5, 45.0  # between cameras on one rig
 MAX_OVERLAY_SHIFT_PX = 4.0  # a picture that fits better elsewhere by more is worth a warning
 MIN_OVERLAY_CONTRAST = 1.25  # below, the best shift says nothing

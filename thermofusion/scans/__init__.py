@@ -81,7 +81,10 @@ def open_scan(path: str | Path, *, format: str | None = None) -> Scan:
             place=root,
             hint=f"name one with --format: {', '.join(f.name for f in FORMATS)}",
         )
-    scan = known.read(root)
+    try:
+        scan = known.read(root)
+    except OSError as e:
+        raise ScanError(f"it cannot be read as {known.name} ({e.strerror})", place=e.filename or root) from None
     rig = (root if root.is_dir() else root.parent) / "rig.json"
     return with_rig(scan, rig) if known.name != "native" and rig.is_file() else scan
 

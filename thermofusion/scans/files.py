@@ -18,17 +18,20 @@ from .pnm import read_pnm
 
 MAX_PIXELS = 64_000_000  # a header that claims more is refused before it is decoded
 MAX_FILE_BYTES = 512 * 2**20  # of one image or text file
+MAX_NAME = 1000  # characters of a path inside a scan
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 COPY_AGAIN = "copy the recording again"
 
 
 def inside(root: Path, name: str, *, place: object) -> Path:
     """`root / name`, refused if it leaves the scan's folder (also through a symbolic link)."""
+    if len(name) > MAX_NAME:
+        raise ScanError(f"the path '{name[:40]}...' is {len(name)} characters long", place=place)
     try:
         root = root.resolve()
         path = (root / name).resolve()
     except (OSError, ValueError, RuntimeError) as e:  # too long, a NUL inside, a loop of links
-        raise ScanError(f"the path '{name[:80]!r}' is not usable ({type(e).__name__})", place=place) from None
+        raise ScanError(f"the path {name[:80]!r} is not usable ({type(e).__name__})", place=place) from None
     if not path.is_relative_to(root):
         raise ScanError(f"the path '{name}' leaves the scan's folder", place=place)
     return path
@@ -89,7 +92,7 @@ def read_numbers(path: Path, *, columns: int | None = None) -> Float:
         if len(row) != width:
             raise ScanError(f"expected {width} numbers, got {len(row)}", place=f"{path}, line {number}")
         rows.append(row)
-    return np.array(rows, np.float64).reshape(len(rows), -1)
+    return np.array(rows, np.float64).reshape(len(rows), len(rows[0]) if rows else columns or 0)
 
 
 def read_image(path: Path, *, shape: tuple[int, int] | None = None, kind: str = "image") -> NDArray:

@@ -20,8 +20,8 @@ COLUMNS = ("stream", "index", "time_s", "path")  # of frames.csv; `shutter` and 
 
 
 def is_native(root: Path) -> bool:
-    """True if the folder holds a scan.json."""
-    return (root / "scan.json").is_file()
+    """A scan.json or a frames.csv is there: without the other one it is a torn scan, not a foreign one."""
+    return (root / "scan.json").is_file() or (root / "frames.csv").is_file()
 
 
 def read_native(root: Path) -> Scan:

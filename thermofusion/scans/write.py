@@ -250,7 +250,10 @@ def _positions(selection: Selection | None, n: int) -> NDArray[np.int64]:
     everything = np.arange(n)
     if selection is None:
         return everything
-    return np.unique(everything[selection if isinstance(selection, slice) else np.asarray(selection)])
+    if isinstance(selection, slice):
+        return everything[selection]
+    picked = np.asarray(selection)
+    return np.unique(everything[picked]) if picked.size else everything[:0]
 
 
 def _take(stream: Stream, kept: NDArray[np.int64]) -> Stream:
