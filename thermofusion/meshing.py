@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix, csr_matrix, diags
+from scipy.sparse import csr_matrix, diags
 from scipy.sparse.csgraph import connected_components
 
 from .types import Bool, Float, Float32, Int
@@ -66,8 +66,8 @@ def vertex_areas(vertices: Float32, triangles: Int) -> Float:
 
 def components(triangles: Int, count: int) -> Int:
     """(V,) number of the connected piece each vertex belongs to."""
-    edges = _edges(triangles)
-    graph = coo_matrix((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    along = (triangles[:, :2].ravel(), triangles[:, 1:].ravel())  # two sides of a triangle connect its three corners
+    graph = csr_matrix((np.ones(len(along[0]), np.int8), along), shape=(count, count))
     return connected_components(graph, directed=False)[1].astype(np.int32)
 
 
@@ -92,41 +92,34 @@ def smooth_positions(vertices: Float32, triangles: Int, iterations: int) -> Floa
     return out.astype(np.float32)
 
 
-def window_normals(vertices: Float32, triangles: Int, window_m: float) -> Float32:
-    """Unit outward normals (V, 3), averaged over a window of the given diameter on the surface.
+def mesh_normals(vertices: Float32, triangles: Int, *, steps: int = 2) -> Float32:
+    """Unit outward normals (V, 3): area-weighted triangle normals, averaged over the neighbours `steps` times.
 
-    Area-weighted triangle normals are diffused over the mesh graph (which never mixes a finger with its neighbour, as
-    a ball in space would) until they have spread as far as over a disc of that diameter: E[r²] = diameter²/8.
+    They never mix a finger with its neighbour, but an irregular mesh makes them less exact than a plane fit.
     """
     n = vertex_sums(triangle_normals(vertices, triangles), triangles, len(vertices)).astype(np.float32)
-    step = _average(triangles, len(vertices), self_weight=1.0)
-    edges = _edges(triangles)
-    length2 = ((vertices[edges[:, 0]] - vertices[edges[:, 1]]) ** 2).sum(1)
-    degree = np.bincount(edges.ravel(), minlength=len(vertices))
-    share = degree[edges] / (degree[edges] + 1.0)  # of a step's weight that leaves the vertex
-    spread2 = float((length2 * (share / degree[edges]).sum(1)).sum() / max(len(vertices), 1))
-    for _ in range(round(window_m**2 / 8 / max(spread2, 1e-12))):
-        n = step @ n
-    length = np.linalg.norm(n, axis=1, keepdims=True)
+    mean = _average(triangles, len(vertices), self_weight=1.0)
+    for _ in range(steps):
+        n = mean @ n
+    return unit(n)
+
+
+def unit(n: Float32) -> Float32:
+    """Rows of (N, 3) at length 1; NaN where the length is 0."""
+    length = np.sqrt(np.einsum("ij,ij->i", n, n))[:, None]
     return np.divide(n, length, out=np.full_like(n, np.nan), where=length > 0)
 
 
-def _edges(triangles: Int) -> Int:
-    """(E, 2) undirected edges, each once."""
-    e = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    e.sort(axis=1)
-    key = np.unique(e[:, 0].astype(np.int64) << 32 | e[:, 1])
-    return np.stack([key >> 32, key & 0xFFFFFFFF], axis=1).astype(np.int32)
-
-
 def _average(triangles: Int, count: int, self_weight: float) -> csr_matrix:
-    """Sparse (V, V) float32 matrix that takes the mean over each vertex's neighbours and, with a weight, itself."""
-    e = _edges(triangles)
-    rows, cols = np.concatenate([e[:, 0], e[:, 1]]), np.concatenate([e[:, 1], e[:, 0]])
-    A = csr_matrix((np.ones(len(rows), np.float32), (rows, cols)), shape=(count, count))
+    """Sparse (V, V) float32 matrix that takes the mean over each vertex's neighbours and, with a weight, itself.
+
+    Going round its triangles names every neighbour of a vertex once (on an open border, all but one).
+    """
+    ones = np.ones(3 * len(triangles), np.float32)
+    A = csr_matrix((ones, (triangles.ravel(), triangles[:, [1, 2, 0]].ravel())), shape=(count, count))
     A = A + diags(np.full(count, np.float32(self_weight)), format="csr", dtype=np.float32)
-    total = np.asarray(A.sum(1)).ravel()
-    return (diags(1 / np.maximum(total, 1e-12), dtype=np.float32) @ A).tocsr()
+    total = np.asarray(A.sum(1), np.float32).ravel()
+    return (diags(1 / np.maximum(total, np.float32(1e-12)), dtype=np.float32) @ A).tocsr()
 
 
 # ---------------------------------------------------------------- the floor
