@@ -280,14 +280,16 @@ def _camera(record: bytes, place: object) -> tuple[FlirParameters, float | None]
     plausible = (
         np.isfinite(list(vars(p).values())).all()
         and p.R1 > 0 < p.R2
-        and p.B > 0
+        and 0 < p.B < 1e5
         and 0 < p.emissivity <= 1
         and 0 < p.window_transmission <= 1
         and 0 <= p.distance_m < 1e5
         and 0 <= p.relative_humidity <= 1
-        and all(-ZERO_DEGC_K < t < 3000 for t in (p.reflected_degC, p.air_degC, p.window_degC))
+        and all(-100 < t < 3000 for t in (p.reflected_degC, p.air_degC, p.window_degC))
     )
-    if not plausible or not 0 < p.air_transmission() <= 1.001:
+    with np.errstate(all="ignore"):  # a damaged number overflows, and is refused for it
+        plausible = plausible and 0 < p.air_transmission() <= 1.001 and np.isfinite(p.signal(p.air_degC))
+    if not plausible:
         raise ScanError("the FLIR camera parameters are not plausible (damaged?)", place=place)
     return p, _time(record, e)
 
