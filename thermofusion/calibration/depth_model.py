@@ -1,0 +1,134 @@
+"""From what a depth camera reports to true depth: smooth metric corrections, and Herrera's form for raw disparity.
+
+Herrera, Kannala, Heikkilä, "Joint depth and color camera calibration with distortion correction", PAMI 2012: Eqs. 5-6,
+1/z = c1 d_u + c0 and d_u = d + D(u, v)·exp(a0 - a1 d). The paper's D has one value per pixel; here it is a smooth field
+of a few control values, which a few dozen boards can carry.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import lambertw
+
+from ..types import Float
+
+FIELD_SHAPE = (
+    4,
+    5,
+)  # control values down and across: the scale of a structured-light camera's bending, about 1/4 image
+
+
+def field_basis(u_px: Float, v_px: Float, size: tuple[int, int], shape: tuple[int, int] = FIELD_SHAPE) -> Float:
+    """(N, rows·columns) weights of a smooth field's control values: tensor product of piecewise linear hats.
+
+    size = (width, height) of the image. Rows sum to 1.
+    """
+
+    def hats(x: Float, n: int, length: int) -> Float:
+        s = np.clip(x / (length - 1), 0, 1) * (n - 1)
+        return np.maximum(0.0, 1.0 - np.abs(s[:, None] - np.arange(n)))
+
+    rows, columns = shape
+    across, down = hats(np.asarray(u_px, float), columns, size[0]), hats(np.asarray(v_px, float), rows, size[1])
+    return (down[:, :, None] * across[:, None, :]).reshape(len(across), rows * columns)
+
+
+@dataclass(frozen=True)
+class MetricDepth:
+    """z_true = z(1 + scale) + offset + z² Σ w_k f_k: scale and offset, and a field that grows as triangulation does.
+
+    size : (width, height), px. sigma_* : priors of scale [1], offset [m] and field [m per m²] (a Kinect bends by some
+    5 mm at 1 m). `scale` is held at 0 where the board's spacing is free: one of the two must carry the metre.
+    """
+
+    size: tuple[int, int]
+    sigma_scale: float = 0.01
+    sigma_offset_m: float = 0.005
+    sigma_field: float = 0.004
+    names: tuple[str, ...] = field(
+        default=("scale", "offset_m", *(f"field_{i}" for i in range(FIELD_SHAPE[0] * FIELD_SHAPE[1])))
+    )
+
+    def start(self) -> Float:
+        return np.zeros(len(self.names))
+
+    def prior_sigma(self) -> Float:
+        return np.array([self.sigma_scale, self.sigma_offset_m] + [self.sigma_field] * (len(self.names) - 2))
+
+    def _basis(self, z: Float, u_px: Float, v_px: Float) -> Float:
+        B = field_basis(u_px, v_px, self.size)
+        return np.concatenate([z[:, None], np.ones((len(z), 1)), z[:, None] ** 2 * B], axis=1)
+
+    def residual(
+        self, theta: Float, value: Float, u_px: Float, v_px: Float, z_plane: Float
+    ) -> tuple[Float, Float, Float]:
+        """(N,) corrected depth minus plane [m], its derivative by theta (N, P) and by z_plane (N,)."""
+        B = self._basis(value, u_px, v_px)
+        return value + B @ theta - z_plane, B, -np.ones(len(value))
+
+    def to_depth_m(self, theta: Float, value: NDArray, u_px: NDArray, v_px: NDArray) -> Float:
+        """True depth along z of reported depth (N,), metres."""
+        z = np.asarray(value, np.float64)
+        return z + self._basis(z, u_px, v_px) @ theta
+
+
+@dataclass(frozen=True)
+class DisparityDepth:
+    """Raw Kinect disparity: 1/z = c1 d_u + c0 with d_u = d + D(u, v) exp(a0 - a1 d).
+
+    Defaults of c0 [1/m] and c1 [1/(m count)] are those of a Kinect v1; a0 is absorbed by D's own scale and kept at 0.
+    """
+
+    size: tuple[int, int]
+    c0: float = 3.0938
+    c1: float = -0.002848
+    decay: float = 0.002
+    sigma_field: float = 3.0  # counts at disparity 0
+    names: tuple[str, ...] = field(
+        default=("c0", "c1", "decay", *(f"field_{i}" for i in range(FIELD_SHAPE[0] * FIELD_SHAPE[1])))
+    )
+
+    def start(self) -> Float:
+        return np.array([self.c0, self.c1, self.decay] + [0.0] * (len(self.names) - 3))
+
+    def prior_sigma(self) -> Float:
+        return np.array([0.15, 1.5e-4, 0.001] + [self.sigma_field] * (len(self.names) - 3))
+
+    def residual(
+        self, theta: Float, value: Float, u_px: Float, v_px: Float, z_plane: Float
+    ) -> tuple[Float, Float, Float]:
+        """(N,) undistorted disparity minus the plane's [counts], its derivatives by theta (N, P) and z_plane (N,)."""
+        c0, c1, decay = theta[:3]
+        B = field_basis(u_px, v_px, self.size)
+        damp = np.exp(-decay * value)
+        bend = B @ theta[3:]
+        plane = (1 / z_plane - c0) / c1
+        J = np.concatenate(
+            [
+                np.full((len(value), 1), 1 / c1),
+                (plane / c1)[:, None],
+                (-value * bend * damp)[:, None],
+                B * damp[:, None],
+            ],
+            axis=1,
+        )
+        return value + bend * damp - plane, J, 1 / (c1 * z_plane**2)
+
+    def to_depth_m(self, theta: Float, value: NDArray, u_px: NDArray, v_px: NDArray) -> Float:
+        """Depth along z of raw disparity (N,), metres."""
+        d = np.asarray(value, np.float64)
+        d_u = d + (field_basis(u_px, v_px, self.size) @ theta[3:]) * np.exp(-theta[2] * d)
+        return 1 / (theta[1] * d_u + theta[0])
+
+    def to_disparity(self, theta: Float, z_m: NDArray, u_px: NDArray, v_px: NDArray) -> Float:
+        """Inverse of `to_depth_m`: the disparity (N,) the camera would report, by Lambert's W (Herrera Eq. 8)."""
+        d_u = (1 / np.asarray(z_m, np.float64) - theta[0]) / theta[1]
+        bend, decay = field_basis(u_px, v_px, self.size) @ theta[3:], theta[2]
+        # d + B e^(-a d) = d_u. With y = a (d_u - d): y e^(-y)... solved as d = d_u + W(-a B e^(-a d_u)) / a
+        return d_u + np.real(lambertw(-decay * bend * np.exp(-decay * d_u))) / decay
+
+
+DepthModel = MetricDepth | DisparityDepth

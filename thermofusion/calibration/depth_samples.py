@@ -1,0 +1,77 @@
+"""Depth on the board: which pixels, which of them belong to its plane, averaged over small cells."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry import project
+from ..types import Camera, Float
+from .views import DepthSamples
+
+CELLS = 14  # cells across the longer side of the board
+MIN_PIXELS = 200  # fewer depth pixels on a board say nothing reliable
+MIN_CELLS = 8
+METRIC_NOISE = 1.5e-3  # m at 1 m, growing as range² (Kinect v1: Khoshelham & Elberink 2012 give 1.4e-3)
+QUANTUM_DISPARITY = 0.5  # counts
+CORRELATED_PIXELS = 9.0  # a structured-light camera's pixels are not independent within its matching window
+
+
+def sample_board(
+    image: NDArray, camera: Camera, T_depth_board: Float, outline_m: Float, *, disparity: bool = False
+) -> DepthSamples | None:
+    """Samples of one view, or None if the board shows too little depth.
+
+    image : (H, W) metres along z (NaN none) or raw disparity (0 or >= 2047 none). outline_m : (4, 3) board corners.
+    On a plane 1/z (and a disparity) is an affine function of the pixel: what departs from the robust affine fit is
+    another surface, a pin or a flying pixel.
+    """
+    corners = outline_m @ T_depth_board[:3, :3].T + T_depth_board[:3, 3]
+    if (corners[:, 2] <= 0.05).any():
+        return None
+    polygon = project(camera, corners)[0]
+    if not np.isfinite(polygon).all():
+        return None
+    mask = np.zeros(image.shape, np.uint8)
+    cv2.fillConvexPoly(mask, np.round(polygon).astype(np.int32), 1)
+    value = image.astype(np.float64)
+    valid = (value > 0) & (value < 2047) if disparity else np.isfinite(value) & (value > 0)
+    v, u = np.nonzero((mask > 0) & valid)
+    if len(u) < MIN_PIXELS:
+        return None
+    y = value[v, u] if disparity else 1 / value[v, u]
+    kept, spread = _on_plane(u, v, y)
+    u, v, y = u[kept], v[kept], y[kept]
+    if len(u) < MIN_PIXELS:
+        return None
+    side = max(np.ptp(u), np.ptp(v)) / CELLS + 1e-9
+    cell = ((v - v.min()) / side).astype(int) * (CELLS + 2) + ((u - u.min()) / side).astype(int)
+    _, which, count = np.unique(cell, return_inverse=True, return_counts=True)
+    full = count >= max(4, 0.25 * np.median(count))
+    if full.sum() < MIN_CELLS:
+        return None
+
+    def mean(a: NDArray) -> Float:
+        return (np.bincount(which, a) / count)[full]
+
+    m = mean(y)
+    out = m if disparity else 1 / m
+    noise = max(spread, QUANTUM_DISPARITY) if disparity else max(spread, METRIC_NOISE) * out**2
+    sigma = np.broadcast_to(noise, m.shape)
+    return DepthSamples(mean(u), mean(v), out, sigma / np.sqrt(np.maximum(count[full] / CORRELATED_PIXELS, 1)))
+
+
+def _on_plane(u: NDArray, v: NDArray, y: Float) -> tuple[NDArray, float]:
+    """Pixels within 4 robust sigmas of the affine fit, and that sigma [unit of y]; started from the median's side."""
+    A = np.stack([u - u.mean(), v - v.mean(), np.ones(len(u))], axis=1).astype(np.float64)
+    A[:, :2] /= max(np.ptp(u), np.ptp(v), 1)
+    w, coefficients, scale = np.ones(len(y)), np.zeros(3), 1.0
+    r = y
+    for _ in range(25):
+        AtW = A.T * w
+        coefficients = np.linalg.solve(AtW @ A + 1e-12 * np.eye(3), AtW @ y)
+        r = y - A @ coefficients
+        scale = 1.4826 * float(np.median(np.abs(r))) + 1e-9
+        w = 1 / (1 + (r / (2 * scale)) ** 2) ** 2
+    return np.abs(r) < 4 * scale, scale
