@@ -1,0 +1,186 @@
+"""What in a depth image is subject, and what is room: floor plane, background behind the subject, what does not move.
+
+A floor looks the same from everywhere and a wall nearly so: left in view they hold point-to-plane odometry in place
+while the camera walks (820 mm adrift on a whole-body scan, 4 mm without them). They go before tracking.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .depthfilter import DepthFrames
+from .geometry import pixel_rays
+from .recipe import Recipe
+from .types import Bool, Camera, Float, Float32, Scan
+
+STEP_PX = 8  # planes are looked for on every eighth pixel of every eighth row
+HYPOTHESES = 200
+MAX_TILT_DEG = 45.0  # of the floor's normal against the camera's up: how far a walking person pitches a camera
+FLOOR_TOLERANCE_M = 0.012  # at 1 m, grows with range²
+MIN_FLOOR_SHARE = 0.04  # of the valid pixels
+MAX_BELOW_SHARE = 0.02  # nothing lies below a floor
+MIN_EXTENT_M = 0.11  # rms extent of the floor's narrower direction: smaller patches are laps and shoulders
+TRACKING_CLEARANCE_M = 0.03  # tracking is better off without what is this near to the floor
+JUMP_AT_1M = 0.05  # depth step between neighbours (times range) that separates two things
+BEHIND_M = 0.30  # clear air between subject and background
+STATIC_FRAMES = 24
+STATIC_SPREAD_AT_1M = 0.012  # a pixel whose depth stays within this (times range²) shows something that does not move
+STATIC_SHARE = 0.6
+
+
+@dataclass(frozen=True, eq=False)
+class FloorPlane:
+    """`n·p + d` is the height above the floor of a point of the depth camera's frame. share : of valid pixels on it."""
+
+    plane: Float
+    share: float
+
+
+class SubjectFrames:
+    """Depth frames in which only the subject is left. Same interface as `DepthFrames`.
+
+    Attributes
+    ----------
+    camera : pinhole camera of the images. floors : {frame: FloorPlane}, filled as frames are loaded.
+    """
+
+    def __init__(self, scan: Scan, recipe: Recipe) -> None:
+        self._frames, self._subject = DepthFrames(scan, recipe.input), recipe.subject
+        self.camera: Camera = self._frames.camera
+        rays = pixel_rays(self.camera)
+        self._rays: Float32 = (rays / rays[..., 2:]).astype(np.float32)
+        self._static = None
+        if recipe.subject.motion == "subject":
+            self._static = static_background(self._frames)
+        self.floors: dict[int, FloorPlane] = {}
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def load(self, i: int) -> Float32:
+        """Frame i, (H, W) float32 metres, NaN = not the subject."""
+        depth = self._frames.load(i)
+        if self._static is not None:
+            depth = np.where(self._static, np.float32(np.nan), depth)
+        if self._subject.floor != "keep":
+            floor = find_floor(depth, self._rays)
+            if floor is not None:
+                self.floors[i] = floor
+                height = (self._rays @ floor.plane[:3].astype(np.float32)) * depth + np.float32(floor.plane[3])
+                depth = np.where(height > TRACKING_CLEARANCE_M, depth, np.float32(np.nan))
+        if self._subject.background == "remove":
+            depth[behind_subject(depth)] = np.nan
+        return depth
+
+
+def find_floor(depth_m: Float32, rays: Float32, *, seed: int = 0) -> FloorPlane | None:
+    """The floor in a depth image: the lowest large plane, roughly level to the camera, with nothing below it.
+
+    rays : (H, W, 3) directions with z = 1. RANSAC over a grid of pixels with a fixed seed, then least squares.
+    None where there is no such plane.
+    """
+    z = depth_m[::STEP_PX, ::STEP_PX].ravel()
+    valid = np.isfinite(z)
+    if valid.sum() < 200:
+        return None
+    p = rays[::STEP_PX, ::STEP_PX].reshape(-1, 3)[valid] * z[valid, None]
+    a, b, c = p[np.random.default_rng(seed).integers(0, len(p), (3, HYPOTHESES))]
+    n = np.cross(b - a, c - a)
+    length = np.linalg.norm(n, axis=1)
+    n *= np.where(n[:, 1] > 0, -1, 1)[:, None]  # up is -y
+    level = (length > 1e-6) & (-n[:, 1] > np.cos(np.radians(MAX_TILT_DEG)) * length)
+    if not level.any():
+        return None
+    n, a = n[level] / length[level, None], a[level]
+    tolerance = np.float32(FLOOR_TOLERANCE_M) * np.maximum(1, p[:, 2] ** 2)
+    height = p @ n.T - np.einsum("ij,ij->i", n, a)
+    on = (np.abs(height) < tolerance[:, None]).sum(0)
+    below = (height < -2 * tolerance[:, None]).sum(0)
+    best = int(np.argmax(on - 5 * below))
+    if on[best] < MIN_FLOOR_SHARE * len(p) or below[best] > MAX_BELOW_SHARE * len(p):
+        return None
+    plane, extent = np.append(n[best], -(n[best] @ a[best])).astype(np.float64), 0.0
+    inliers = np.zeros(len(p), bool)
+    for _ in range(3):
+        inliers = np.abs(p @ plane[:3] + plane[3]) < tolerance
+        if inliers.sum() < 50:
+            return None
+        centre = p[inliers].mean(0)
+        _, s, axes = np.linalg.svd(p[inliers] - centre, full_matrices=False)
+        normal = axes[2] * (-1 if axes[2, 1] > 0 else 1)
+        plane, extent = np.append(normal, -(normal @ centre)).astype(np.float64), float(s[1] / np.sqrt(inliers.sum()))
+    return FloorPlane(plane, float(inliers.mean())) if extent > MIN_EXTENT_M else None
+
+
+def behind_subject(depth_m: Float32) -> Bool:
+    """Pixels (H, W) of things that stand clear behind the subject.
+
+    The image falls into pieces at depth steps; the subject is the piece that is largest, nearness and centrality
+    weighed in; pieces that begin `BEHIND_M` behind its end are background.
+    """
+    small = depth_m[::4, ::4]
+    labels, n = _pieces(small)
+    if n <= 1:
+        return np.zeros(depth_m.shape, bool)
+    v, u = np.nonzero(labels)
+    label, z = labels[v, u], small[v, u]
+    h, w = small.shape
+    weight = np.exp(-(((u - w / 2) / (w / 2)) ** 2) - 0.25 * ((v - h / 2) / (h / 2)) ** 2) / z**2
+    subject = int(np.argmax(np.bincount(label, weight * z**2, n + 1) * _nearness(label, z, n)))
+    far = float(np.percentile(z[label == subject], 98))
+    near = np.full(n + 1, np.inf)
+    np.minimum.at(near, label, z)
+    background = near > far + BEHIND_M
+    background[0] = False
+    mask = background[labels].astype(np.uint8)
+    if not mask.any():
+        return np.zeros(depth_m.shape, bool)
+    big = cv2.resize(mask, (4 * w, 4 * h), interpolation=cv2.INTER_NEAREST)[: depth_m.shape[0], : depth_m.shape[1]]
+    grown = cv2.dilate(big, np.ones((5, 5), np.uint8)).astype(bool)
+    return np.asarray(grown & (depth_m > far + BEHIND_M))
+
+
+def _nearness(label: NDArray, z: Float32, n: int) -> Float:
+    """Factor per piece that prefers near ones: 1/z² of its mean depth."""
+    count = np.maximum(np.bincount(label, minlength=n + 1), 1)
+    mean = np.bincount(label, z, n + 1) / count
+    return 1 / np.maximum(mean, 0.1) ** 2
+
+
+def _pieces(depth_m: Float32) -> tuple[NDArray, int]:
+    """Connected pieces of a depth image, cut at depth steps: labels (H, W), 0 = none; and their number."""
+    z = np.nan_to_num(depth_m)
+    step = np.float32(JUMP_AT_1M) * np.maximum(z, 0.3)
+    cut = np.zeros(z.shape, bool)
+    cut[:, 1:] |= np.abs(np.diff(z, axis=1)) > step[:, 1:]
+    cut[1:] |= np.abs(np.diff(z, axis=0)) > step[1:]
+    n, labels = cv2.connectedComponents(((z > 0) & ~cut).astype(np.uint8), connectivity=4)
+    return labels, n - 1
+
+
+def static_background(frames: DepthFrames) -> Bool:
+    """Pixels (H, W) of what does not move while the subject turns before a standing camera.
+
+    A pixel is static when its depth hardly varies over frames spread through the recording; a piece of the image (cut
+    at depth steps) is background when most of it is static.
+    """
+    picked: Sequence[int] = np.unique(np.linspace(0, len(frames) - 1, STATIC_FRAMES).astype(int)).tolist()
+    stack = np.stack([d[::2, ::2] for _, d in frames.read_ahead(picked)])
+    seen = np.isfinite(stack).sum(0)
+    typical = np.nanmedian(np.where(seen > 0, stack, 9.0), axis=0).astype(np.float32)
+    with np.errstate(invalid="ignore"):
+        spread = np.nanmedian(np.abs(np.where(seen > 0, stack, 9.0) - typical), axis=0) * 2
+    present = seen >= 0.5 * len(stack)
+    static = present & (spread < STATIC_SPREAD_AT_1M * typical**2)
+    labels, n = _pieces(np.where(present, typical, np.nan).astype(np.float32))
+    size = np.maximum(np.bincount(labels.ravel(), minlength=n + 1), 1)
+    share = np.bincount(labels.ravel(), static.ravel(), n + 1) / size
+    room = (share > STATIC_SHARE) & (np.arange(n + 1) > 0)
+    mask = (room[labels] | (static & (labels == 0))).astype(np.uint8)
+    h, w = frames.camera.shape
+    return cv2.resize(mask, (w, h), interpolation=cv2.INTER_NEAREST).astype(bool)
