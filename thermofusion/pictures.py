@@ -22,8 +22,8 @@ from .lettering import INK, QUIET
 from .raycasts import RAYS, Cast, cast_views
 from .types import Float32, ThermalMesh, UInt8
 
-HATCH_RGB = ((226, 226, 226), (190, 190, 190))
-INSIDE_RGB = (140, 140, 140)
+UNMEASURED_RGB = ((226, 226, 226), (190, 190, 190))  # stripes falling to the left,
+INSIDE_RGB = ((112, 112, 112), (84, 84, 84))  # and to the right: no palette can be mistaken for either
 OUTLINE_RGB, OUTLINE_ALPHA = (40, 40, 44), 0.75
 CREASE_PX = 10.0  # a step in depth of this many pixels is an edge: a slope of 84° is none
 _LABELS = {"front": "front (toward the first camera)"}
@@ -60,10 +60,10 @@ def render_views(
     `cast_mesh`, where several maps of one surface are drawn. Raises RecipeError, ValueError (no triangles).
     """
     lo, hi = palettes.color_range(mesh.temperature_degC, range_degC)
-    level = "level anchored to a reference" if mesh.anchored else "relative: the level is not anchored"
+    level = "level anchored to a reference" if mesh.anchored else "level relative: no reference"
     what = {"absolute": "Skin temperature", "normal-equivalent": "Normal-equivalent temperature"}
     title = what.get(mesh.mode, "Apparent temperature")
-    scale = Scale(palette, lo, hi, "°C", title, f"{mesh.mode}, {level}", shading)
+    scale = Scale(palette, lo, hi, "°C", title, f"output {mesh.mode}; {level}", shading)
     casts = casts or cast_mesh(mesh, height_px=height_px, up=up, front=front)
     return draw(casts, mesh.temperature_degC, scale, height_px=height_px)
 
@@ -137,18 +137,19 @@ def draw(casts: list[Cast], values: NDArray, scale: Scale, *, height_px: int) ->
     """One page per view, and `overview` with all of them side by side under one bar."""
     finite = values[np.isfinite(values)]
     beyond = bool((finite < scale.lo).any()), bool((finite > scale.hi).any())
-    hatched = len(finite) < len(values)
+    legend = ["unmeasured"] if len(finite) < len(values) else []
+    legend += ["inside"] if any((cast.facing < 0).any() for cast in casts) else []
     panels = {cast.name: paint(cast, values, scale) for cast in casts}
     page, px_per_m = _Page(height_px), casts[0].px_per_m
-    pages = {name: page.compose({name: panel}, scale, beyond, hatched, px_per_m) for name, panel in panels.items()}
-    return pages | {"overview": page.compose(panels, scale, beyond, hatched, px_per_m)}
+    pages = {name: page.compose({name: panel}, scale, beyond, legend, px_per_m) for name, panel in panels.items()}
+    return pages | {"overview": page.compose(panels, scale, beyond, legend, px_per_m)}
 
 
 def paint(cast: Cast, values: NDArray, scale: Scale) -> UInt8:
     """The view alone, (H, W, 3) on white.
 
     A pixel is the share-weighted mix of what its rays meet: skin (their mean value, coloured), unmeasured skin
-    (hatched), the surface's inside (dark grey: its temperature is the other side's), background; plus a thin outline.
+    (hatched), the surface's inside (dark: its temperature is the other side's), background; plus a thin outline.
     """
     value, inside = cast.interpolate(values), cast.facing < 0
     skin = ~inside & ~np.isnan(value)
@@ -159,7 +160,7 @@ def paint(cast: Cast, values: NDArray, scale: Scale) -> UInt8:
         lit = cast.per_pixel(np.where(skin, 1 - scale.shading * (1 - cast.facing), 0))
         rgb *= (lit / np.maximum(share["skin"], 1e-6))[..., None]
     rgb += share["bare"][..., None] * _hatch(cast.shape)
-    rgb += share["inside"][..., None] * np.array(INSIDE_RGB, np.float32)
+    rgb += share["inside"][..., None] * _hatch(cast.shape, inside=True)
     rgb += (1 - share["skin"] - share["bare"] - share["inside"])[..., None] * np.float32(255)
     line = _outline(cast)[..., None]
     painted: UInt8 = np.round(np.clip(rgb * (1 - line) + line * np.array(OUTLINE_RGB), 0, 255)).astype(np.uint8)
@@ -181,10 +182,11 @@ def _outline(cast: Cast) -> Float32:
     return np.float32(OUTLINE_ALPHA) * line.reshape(h, RAYS, w, RAYS).any(axis=3).sum(axis=1, dtype=np.float32) / RAYS
 
 
-def _hatch(shape: tuple[int, int]) -> Float32:
-    """Diagonal stripes (H, W, 3), which no palette can be mistaken for."""
-    stripe = (np.add.outer(np.arange(shape[0]), np.arange(shape[1])) // 4) % 2
-    return np.array(HATCH_RGB, np.float32)[stripe]
+def _hatch(shape: tuple[int, int], *, inside: bool = False) -> Float32:
+    """Diagonal stripes (H, W, 3) of unmeasured skin, or of the surface seen from inside."""
+    columns = np.arange(shape[1])
+    stripe = (np.add.outer(np.arange(shape[0]), columns[::-1] if inside else columns) // 4) % 2
+    return np.array(INSIDE_RGB if inside else UNMEASURED_RGB, np.float32)[stripe]
 
 
 def _round_step(values: NDArray) -> float:
@@ -200,7 +202,7 @@ class _Page:
 
     def __init__(self, height_px: int) -> None:
         self.height, self.unit = height_px, height_px / 900
-        self.top, self.bottom, self.side, self.bar = (self._px(x) for x in (104, 52, 28, 150))
+        self.top, self.bottom, self.side, self.bar = (self._px(x) for x in (104, 52, 28, 168))
         self.chrome_px = self.top + self.bottom
 
     def _px(self, at_900: float) -> int:
@@ -211,7 +213,7 @@ class _Page:
         panels: Mapping[str, UInt8],
         scale: Scale,
         beyond: tuple[bool, bool],
-        hatched: bool,
+        legend: list[str],
         px_per_m: float,
     ) -> UInt8:
         """Title above, panels side by side, bar at the right, a ruler below."""
@@ -229,21 +231,22 @@ class _Page:
             label = _LABELS.get(name, name) if len(panels) == 1 else name
             lettering.write(image, label, x + w / 2, self._px(92), small, align="center")
             x += w + self.side
-        self._bar(image, scale, beyond, hatched)
+        self._bar(image, scale, beyond, legend)
         self._ruler(image, px_per_m)
         return image
 
-    def _bar(self, image: UInt8, scale: Scale, beyond: tuple[bool, bool], hatched: bool) -> None:
-        x, y = image.shape[1] - self.bar + self._px(10), self._px(190)
-        box = (x, y, self._px(26), self.height - y - self._px(170))
+    def _bar(self, image: UInt8, scale: Scale, beyond: tuple[bool, bool], legend: list[str]) -> None:
+        """The colour bar, and below it what the colours beside it mean."""
+        x, y, side, size = image.shape[1] - self.bar + self._px(10), self._px(190), self._px(26), 12 * self.unit
+        box = (x, y, side, self.height - y - self._px(170))
         below, above = beyond
-        size = 12 * self.unit
         lettering.color_bar(image, box, scale.palette, scale.lo, scale.hi, scale.unit, size, below=below, above=above)
-        if hatched:
-            top, side = self.height - self._px(112), self._px(26)
-            image[top : top + side, x : x + side] = _hatch((side, side)).astype(np.uint8)
+        top = self.height - self._px(122)
+        for name in legend:
+            image[top : top + side, x : x + side] = _hatch((side, side), inside=name == "inside")
             cv2.rectangle(image, (x - 1, top - 1), (x + side, top + side), INK, max(self._px(1), 1))
-            lettering.write(image, "unmeasured", x + side + size * 0.9, top + (side + size) / 2, size)
+            lettering.write(image, name, x + side + size * 0.9, top + (side + size) / 2, size)
+            top += self._px(40)
 
     def _ruler(self, image: UInt8, px_per_m: float) -> None:
         """A length to go by: 1, 2 or 5 times a power of ten, about a tenth of the page's height."""
