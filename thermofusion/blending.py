@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 
-from .crosscal import TUKEY, CrosscalResult
+from .crosscal import CrosscalResult
 from .emissivity import EmissivityModel, follows_shape
+from .overlap import TUKEY
 from .radiometry import ZERO_DEGC_K, Band, leaving_radiance, paper_chain
 from .recipe import RadiometrySection
 from .types import Bool, Float, Float32, Int, Observations, OutputMode

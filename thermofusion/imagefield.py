@@ -37,6 +37,11 @@ class ImageField:
         mixing = np.linalg.solve(r, np.eye(len(r)))[:, 1:] * scale[1:]
         return cls(width_px, height_px, exponents, mixing, np.zeros(mixing.shape[1]))
 
+    @property
+    def orders(self) -> Int:
+        """(K,) polynomial order of each pattern."""
+        return np.asarray(self.exponents[1:].sum(axis=1), np.int32)
+
     def patterns(self, u_px: NDArray, v_px: NDArray) -> Float:
         """(N, K) the patterns at pixels."""
         return _monomials(u_px, v_px, self.width_px, self.height_px, self.exponents) @ self.mixing
