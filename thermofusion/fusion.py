@@ -33,6 +33,7 @@ PLANE_PER_WINDOW = 0.4  # radius of a plane fit, of the normal window: see windo
 MAX_NEIGHBOURS = 100  # in a plane fit
 PLANE_AGREES_COS = 0.8  # 37°: a plane fit farther from the mesh's own normal caught another part of the body
 SEEN_TRUNCATIONS = 2.0  # a vertex is on a frame's surface if nearer to it than this, in truncations
+VOTE_SHARE = 0.05  # of what a frame sees; less is a hand in front or a chair's leg
 MAX_WALK_M = 100.0  # a camera path longer across than this is in another unit
 
 
@@ -101,7 +102,7 @@ def fuse_surface(
             place=scan.root,
             hint="the trajectory must be T_world_depth in metres; `thermofusion check` shows the streams",
         )
-    vertices, triangles = meshing.canonical(vertices, triangles, plan.voxel_m / 1000)
+    vertices, triangles = meshing.canonical(vertices, triangles)
     vertices, triangles, plane, removed, notes = _clean(vertices, triangles, survey, plan, recipe, floor_plane)
     if len(triangles) == 0:
         raise ScanError(
@@ -220,8 +221,8 @@ def _pieces(
 ) -> tuple[Float32, Int, tuple[RemovedPart, ...]]:
     """The connected pieces that are the subject.
 
-    The subject is what the camera looked at all the time: pieces are ranked by area x the share of frames that saw it,
-    so a large wall, seen in passing, comes after a small subject. Where the background is kept, only specks go.
+    The subject is what the camera walked round: in most frames the nearest thing of some size. A wall may be larger and
+    fill more of the images, but stands behind. Where the background is kept, only specks go.
     """
     subject = recipe.subject
     if len(triangles) == 0:
@@ -232,8 +233,8 @@ def _pieces(
     large = area_cm2 >= subject.min_component_cm2
     keep = large.copy()
     if subject.background == "remove" and 0 < subject.keep_components < large.sum():
-        attention = np.bincount(label, areas * _seen_share(vertices, survey, plan))
-        ranked = np.flatnonzero(large)[np.argsort(-attention[large], kind="stable")]
+        votes = _votes(vertices, areas, label, survey, plan)
+        ranked = np.flatnonzero(large)[np.argsort(-votes[large], kind="stable")]
         keep[ranked[subject.keep_components :]] = False
     removed = []
     for reason, gone in (("beside the subject", large & ~keep), ("specks", ~large)):
@@ -243,13 +244,20 @@ def _pieces(
     return vertices, triangles, tuple(removed)
 
 
-def _seen_share(vertices: Float32, survey: Survey, plan: GridPlan) -> Float:
-    """(V,) share of the sampled frames on whose own surface a vertex lies."""
-    count, (h, w) = np.zeros(len(vertices)), survey.camera.shape
+def _votes(vertices: Float32, areas: Float, label: Int, survey: Survey, plan: GridPlan) -> Float:
+    """(pieces,) sampled frames in which a piece is the nearest that fills 5 % of what is seen; plus its mean share."""
+    (h, w), pieces = survey.camera.shape, int(label.max()) + 1
+    votes = np.zeros(pieces)
     for depth, T in zip(survey.depth, survey.T_world_depth, strict=True):
         uv, z = project(survey.camera, transform_points(invert(T), vertices))
         u, v = (np.nan_to_num(np.rint(uv[:, i]), nan=-1.0) for i in range(2))
-        inside = np.flatnonzero((u >= 0) & (u < w) & (v >= 0) & (v < h))
-        there = depth[v[inside].astype(np.intp), u[inside].astype(np.intp)]
-        count[inside] += np.abs(there - z[inside]) < SEEN_TRUNCATIONS * plan.truncation_m
-    return count / len(survey.depth)
+        i = np.flatnonzero((u >= 0) & (u < w) & (v >= 0) & (v < h))
+        there = depth[v[i].astype(np.intp), u[i].astype(np.intp)]
+        i = i[np.abs(there - z[i]) < SEEN_TRUNCATIONS * plan.truncation_m]
+        angle = areas[i] / z[i] ** 2  # about the solid angle
+        share = np.bincount(label[i], angle, pieces) / max(angle.sum(), 1e-12)
+        if len(i):
+            z_mean = np.bincount(label[i], angle * z[i], pieces) / np.maximum(share * angle.sum(), 1e-12)
+            votes[np.where(share > VOTE_SHARE, z_mean, np.inf).argmin()] += 1
+        votes += share / (len(survey.depth) + 1)
+    return votes

@@ -18,31 +18,24 @@ FLOOR_HYPOTHESES = 400
 TAUBIN_SHRINK, TAUBIN_INFLATE = 0.5, -0.53  # low pass without shrinkage (Taubin 1995)
 
 
-def canonical(vertices: Float32, triangles: NDArray, merge_m: float) -> tuple[Float32, Int]:
+def canonical(vertices: Float32, triangles: NDArray) -> tuple[Float32, Int]:
     """The same surface in an order that depends on its shape alone.
 
-    Marching cubes on a hash map deliver vertices in any order. Here vertices (V, 3) nearer than about `merge_m` are
-    merged, then sorted by z, y, x; triangles lose degenerate ones, start at their lowest vertex, and are sorted.
+    Marching cubes on a hash map deliver vertices in any order. Here vertices (V, 3) are sorted by z, y, x, and equal
+    ones merged; triangles lose degenerate ones, start at their lowest vertex, and are sorted.
     """
-    origin = vertices.min(0)
-    cells = np.rint((vertices - origin) / np.float32(merge_m)).astype(np.int64)
-    extent = cells.max(0) + 1
-    if float(extent[0]) * float(extent[1]) * float(extent[2]) >= 2**62:
-        raise ValueError("the surface is too large for its resolution")
-    key = (cells[:, 2] * extent[1] + cells[:, 1]) * extent[0] + cells[:, 0]
-    # Among vertices that fall together the smallest by coordinates represents them, whatever came first.
-    order = np.lexsort((vertices[:, 0], vertices[:, 1], vertices[:, 2], key))
-    first = np.ones(len(key), bool)
-    first[1:] = np.diff(key[order]) != 0
-    new = np.empty(len(key), np.int64)
+    vertices = vertices + np.float32(0)  # -0.0 becomes 0.0: equal numbers get equal bits
+    order = np.lexsort(vertices.T)
+    ordered = vertices[order]
+    first = np.ones(len(order), bool)
+    first[1:] = (ordered[1:] != ordered[:-1]).any(1)
+    new = np.empty(len(order), np.int32)
     new[order] = np.cumsum(first) - 1
-    out: Float32 = vertices[order[first]]
     tri = new[triangles]
     tri = tri[(tri[:, 0] != tri[:, 1]) & (tri[:, 1] != tri[:, 2]) & (tri[:, 2] != tri[:, 0])]
     lead = tri.argmin(1)[:, None]
     tri = np.take_along_axis(tri, (lead + np.arange(3)) % 3, axis=1)
-    tri = tri[np.lexsort((tri[:, 2], tri[:, 1], tri[:, 0]))]
-    return out, tri.astype(np.int32)
+    return ordered[first], tri[np.lexsort((tri[:, 2], tri[:, 1], tri[:, 0]))]
 
 
 def triangle_normals(vertices: Float32, triangles: Int) -> Float32:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,14 +24,15 @@ BYTES_PER_BLOCK = BLOCK**3 * (8 + 16)  # tsdf and weight, plus the table that me
 SURVEY_FRAMES = 16  # enough for ranges, noise and extent; a tenth of a second
 NOISE_M_AT_1M = 1.425e-3  # Kinect v1 depth noise is about this times z² (Khoshelham & Elberink 2012)
 NOISE_BOUNDS = (0.4e-3, 6e-3)  # of the coefficient estimated from the data
-VOXEL_PER_NOISE, VOXEL_PER_FOOTPRINT = 1.5, 0.8  # finer voxels than this hold noise, or what no thermal pixel resolves
+VOXEL_PER_NOISE, VOXEL_PER_FOOTPRINT = 1.8, 0.8  # finer voxels than this hold noise, or what no thermal pixel resolves
 VOXEL_BOUNDS_M = (2e-3, 10e-3)
-TRUNCATION_PER_NOISE = 5.0  # wide enough that noise is averaged, not cut; wider rounds off edges
+TRUNCATION_PER_NOISE = 6.0  # wide enough that noise is averaged, not cut; wider rounds off edges
 FAR_NOISE_PER_TRUNCATION = 0.5  # depth noisier than this share of the truncation would only blur
 FAR_PER_MEDIAN = 1.3  # but nothing nearer than this share of the median range is given up
 MIN_TRUNCATION_VOXELS = 3.0
 MAX_VOXEL_M = 0.1
 ESTIMATE_MARGIN = 1.1
+TOUCH_STRIDE_PX, TOUCHES_PER_BLOCK = 4, 3
 GROWTH = 1.3  # of the block table, each time it is full
 
 Progress = Callable[[str, int, int], None]
@@ -100,18 +102,19 @@ def survey_depth(scan: Scan, frames: Frames, poses: FramePoses) -> Survey:
 def depth_noise(images: tuple[Float32, ...] | list[Float32]) -> float:
     """Depth noise, one sigma in metres at 1 m, growing with range² as a triangulating camera's does.
 
-    From second differences over 4 px, which a smooth surface hardly has and in which noise of a few pixels'
-    correlation is whole: z(u-4) - 2 z(u) + z(u+4) has variance 6 σ². Median absolute deviation, so edges do not count.
+    From third differences over 3 px, in which neither slope nor curvature of the surface is left, and noise that is
+    correlated over a pixel or two is whole: -z(u) + 3 z(u+3) - 3 z(u+6) + z(u+9) has variance 20 σ². Median absolute
+    deviation, so edges do not count.
     """
     r = []
     for d in images:
-        with np.errstate(invalid="ignore"):
-            q = (d[::2, 8:] - 2 * d[::2, 4:-4] + d[::2, :-8]) / d[::2, 4:-4] ** 2
+        z = d[::2]
+        q = (z[:, 9:] - z[:, :-9] + 3 * (z[:, 3:-6] - z[:, 6:-3])) / z[:, 3:-6] ** 2
         r.append(q[np.isfinite(q)])
     values = np.concatenate(r)
     if len(values) < 1000:
         return NOISE_M_AT_1M
-    return float(np.clip(1.4826 * np.median(np.abs(values)) / np.sqrt(6), *NOISE_BOUNDS))
+    return float(np.clip(1.4826 * np.median(np.abs(values)) / np.sqrt(20), *NOISE_BOUNDS))
 
 
 def plan_grid(scan: Scan, survey: Survey, recipe: Recipe) -> GridPlan:
@@ -168,7 +171,7 @@ def _estimate_blocks(survey: Survey, plan: GridPlan) -> int:
 
     If doubling the sample from half to whole added g blocks, doubling it again and again adds g/2 + g/4 + ... = g.
     """
-    grid = VoxelGrid(survey.camera, plan, 1)
+    grid = VoxelGrid(survey, plan, 1)
     touched = [grid.touch(d, T) for d, T in zip(survey.depth, survey.T_world_depth, strict=True)]
     half, whole = _count_unique(touched[::2]), _count_unique(touched)
     return int(ESTIMATE_MARGIN * (2 * whole - half))
@@ -185,7 +188,7 @@ def _count_unique(blocks: list[NDArray[np.int32]]) -> int:
 class VoxelGrid:
     """A truncated signed distance field in blocks of 8³ voxels, each holding distance and weight as float32."""
 
-    def __init__(self, camera: Camera, plan: GridPlan, capacity: int) -> None:
+    def __init__(self, survey: Survey, plan: GridPlan, capacity: int) -> None:
         from ._open3d import o3d
 
         self._o3d, self._plan = o3d, plan
@@ -197,10 +200,17 @@ class VoxelGrid:
         )
         # Open3D takes the pixel whose index is floor(u), which puts the first pixel's centre at (0.5, 0.5). Ours is at
         # (0, 0). Without the shift surfaces lie half a pixel aside: 0.43 instead of 0.23 mm mean error at 1.1 m.
-        K = camera.K.copy()
+        K = survey.camera.K.copy()
         K[:2, 2] += 0.5
         self._K = o3d.core.Tensor(K)
         self._multiplier = plan.truncation_m / plan.voxel_m
+        # Open3D looks for blocks along every fourth pixel's ray. A coarse image is enlarged for that: else the corner of
+        # a block slips through between rays in most frames, and is a hole in the end.
+        stride_m = TOUCH_STRIDE_PX * survey.median_range_m / survey.camera.focal_px
+        self._enlarge = max(1, int(np.ceil(TOUCHES_PER_BLOCK * stride_m / (BLOCK * plan.voxel_m))))
+        K_touch = K.copy()
+        K_touch[:2] *= self._enlarge
+        self._K_touch = o3d.core.Tensor(K_touch)
 
     @property
     def blocks(self) -> int:
@@ -209,10 +219,8 @@ class VoxelGrid:
 
     def touch(self, depth_m: Float32, T_world_depth: Float) -> NDArray[np.int32]:
         """(N, 3) coordinates of the blocks within the truncation of a frame's surface."""
-        image, extrinsic = self._arguments(depth_m, T_world_depth)
-        if image is None:
-            return np.zeros((0, 3), np.int32)
-        return self._blocks(image, extrinsic).numpy()
+        depth = self._depth(depth_m)
+        return self._blocks(depth, self._o3d.core.Tensor(invert(T_world_depth))).numpy()
 
     def integrate(self, depth_m: Float32, T_world_depth: Float) -> bool:
         """Average a frame into the field. False, with the field unchanged, if that needs more blocks than allowed.
@@ -220,16 +228,17 @@ class VoxelGrid:
         The table is enlarged before the blocks go in: one that overflows while they do loses blocks, and the surface
         gets holes.
         """
-        image, extrinsic = self._arguments(depth_m, T_world_depth)
-        if image is None:
+        depth, extrinsic = self._depth(depth_m), self._o3d.core.Tensor(invert(T_world_depth))
+        blocks, table = self._blocks(depth, extrinsic), self._grid.hashmap()
+        if len(blocks) == 0:
             return True
-        blocks, table = self._blocks(image, extrinsic), self._grid.hashmap()
         if table.size() + len(blocks) > table.capacity():
             needed = table.size() + int((~table.find(blocks)[1].numpy()).sum())
             if needed > self._plan.max_blocks:
                 return False
             if needed > 0.95 * table.capacity():
                 table.reserve(int(max(needed, table.capacity()) * GROWTH) + 8)
+        image = self._o3d.t.geometry.Image(self._o3d.core.Tensor(depth))
         self._grid.integrate(blocks, image, self._K, extrinsic, 1.0, self._plan.max_range_m, self._multiplier)
         return True
 
@@ -237,22 +246,30 @@ class VoxelGrid:
         """Vertices (V, 3) and triangles (F, 3) of the zero level where it was seen at least `min_weight` times."""
         if self.blocks == 0:
             return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)
-        # Open3D wants weights *above* its threshold; they are whole numbers here.
-        mesh = self._grid.extract_triangle_mesh(weight_threshold=min_weight - 0.5)
+        try:  # Open3D wants weights *above* its threshold; they are whole numbers here.
+            mesh = self._grid.extract_triangle_mesh(weight_threshold=min_weight - 0.5)
+        except RuntimeError as e:
+            if "has shape {0}" not in str(e):  # how it says that there is no surface
+                raise
+            return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)
         if "indices" not in mesh.triangle or "positions" not in mesh.vertex:
             return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)
         return mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy()
 
-    def _arguments(self, depth_m: Float32, T_world_depth: Float) -> tuple[Any, Any]:
-        tensor = self._o3d.core.Tensor
-        depth = np.where(depth_m <= self._plan.max_range_m, depth_m, np.float32(0))  # Open3D's "none" is 0
-        if not depth.any():
-            return None, None
-        return self._o3d.t.geometry.Image(tensor(depth)), tensor(invert(T_world_depth))
+    def _depth(self, depth_m: Float32) -> Float32:
+        return np.where(depth_m <= self._plan.max_range_m, depth_m, np.float32(0))  # Open3D's "none" is 0
 
-    def _blocks(self, image: Any, extrinsic: Any) -> Any:
+    def _blocks(self, depth: Float32, extrinsic: Any) -> Any:
+        """Coordinates (N, 3) of the blocks near the surface, looked for a voxel farther than will be filled."""
+        core = self._o3d.core
+        if not depth.any():
+            return core.Tensor(np.zeros((0, 3), np.int32))
+        fine: NDArray[Any] = depth
+        if self._enlarge > 1:
+            fine = cv2.resize(depth, None, fx=self._enlarge, fy=self._enlarge, interpolation=cv2.INTER_NEAREST)
+        image = self._o3d.t.geometry.Image(core.Tensor(fine))
         return self._grid.compute_unique_block_coordinates(
-            image, self._K, extrinsic, 1.0, self._plan.max_range_m, self._multiplier
+            image, self._K_touch, extrinsic, 1.0, self._plan.max_range_m, self._multiplier + 1
         )
 
 
@@ -261,7 +278,7 @@ def integrate_frames(
 ) -> tuple[VoxelGrid, GridPlan]:
     """All frames into a grid. Should the estimate have been far too low, once more with coarser voxels."""
     while True:
-        grid, full = VoxelGrid(survey.camera, plan, min(plan.blocks, plan.max_blocks)), False
+        grid, full = VoxelGrid(survey, plan, min(plan.blocks, plan.max_blocks)), False
         for n, (_, depth) in enumerate(frames.read_ahead(poses.frame.tolist())):
             if not grid.integrate(depth, poses.T_world_depth[n]):
                 full = True

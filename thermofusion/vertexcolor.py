@@ -13,7 +13,7 @@ from .types import Camera, Float, Float32, Scan, Trajectory, UInt8
 MAX_VIEWS = 30  # each vertex of a walk round is then seen about ten times
 MIN_COS = 0.3  # views more oblique than 72° carry no colour worth having
 CELL_PX = 4  # of the coarse depth buffer
-HIDDEN_M = 0.02  # a vertex this far behind the nearest surface in its cells is hidden
+HIDDEN_M = 0.02  # a vertex this far behind the nearest surface in its cells is hidden, more where it slopes
 OUTLIER_LEVELS = 20.0  # of 255: farther from the mean than this a view counts little (highlights, stray occlusion)
 UNSEEN = (128, 128, 128)  # vertices that no colour frame saw
 
@@ -61,7 +61,9 @@ def _look(
     u, v = (np.nan_to_num(uv[:, i], nan=-1.0) for i in range(2))
     inside = (u >= 0) & (u <= w - 1) & (v >= 0) & (v <= h - 1)
     near, u, v, z = near[inside], u[inside], v[inside], z[inside]
-    visible = z < _nearest(u, v, z, camera) + HIDDEN_M
+    cos = facing[near]
+    slope = np.sqrt(np.maximum(1 - cos**2, 0)) / cos * z * np.float32(1.5 * CELL_PX / camera.focal_px)
+    visible = z < _nearest(u, v, z, camera) + HIDDEN_M + slope
     near, u, v, z = near[visible], u[visible], v[visible], z[visible]
     rgb = image[np.rint(v).astype(np.intp), np.rint(u).astype(np.intp)].astype(np.float32)
     return near, rgb, (facing[near] ** 2 / z**2).astype(np.float32)

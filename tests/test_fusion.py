@@ -1,0 +1,395 @@
+"""Fusion against shapes whose surface is a formula: rendered with Kinect noise, fused, compared."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thermofusion import meshing
+from thermofusion.depthfilter import DepthFrames
+from thermofusion.errors import ResourceError, ScanError
+from thermofusion.fusion import FusionResult, depth_poses, fuse_surface, window_normals
+from thermofusion.geometry import pixel_rays
+from thermofusion.recipe import load_recipe
+from thermofusion.tsdf import Frames, depth_noise, integrate_frames, plan_grid, survey_depth
+from thermofusion.types import Camera, Rig, Scan, Stream, Trajectory
+
+CAMERA = Camera(240, 180, np.array([[230.0, 0, 121.3], [0, 233.0, 88.2], [0, 0, 1]]))
+LENS = Camera(
+    320, 240, np.array([[260.0, 0, 158.0], [0, 262.0, 121.0], [0, 0, 1]]), np.array([0.05, -0.1, 1e-3, -8e-4, 0])
+)
+NOISE = 1.425e-3  # m at 1 m, Kinect v1
+RECIPE = {"fusion": {"voxel_mm": 4, "normal_window_mm": 30}, "subject": {"min_component_cm2": 20}}
+COARSE = {**RECIPE, "fusion": {"voxel_mm": 8}}
+
+
+# ---------------------------------------------------------------- shapes: nearest distance along rays, inf = missed
+
+
+def sphere(center, radius):
+    def hit(origin, direction):
+        m = origin - np.asarray(center)
+        b = direction @ m
+        with np.errstate(invalid="ignore"):
+            t = -b - np.sqrt(b**2 - (m @ m - radius**2))
+        return np.where(t > 0, t, np.inf)
+
+    return hit
+
+
+def post(x, y, radius, bottom, top):
+    """An upright cylinder without lids."""
+
+    def hit(origin, direction):
+        m, d = origin[:2] - [x, y], direction[..., :2]
+        a, b, c = (d**2).sum(-1), d @ m, m @ m - radius**2
+        with np.errstate(invalid="ignore", divide="ignore"):
+            t = (-b - np.sqrt(b**2 - a * c)) / a
+            z = origin[2] + t * direction[..., 2]
+        return np.where((t > 0) & (z > bottom) & (z < top), t, np.inf)
+
+    return hit
+
+
+def plane(n, d):
+    def hit(origin, direction):
+        with np.errstate(divide="ignore"):
+            t = -(origin @ n + d) / (direction @ n)
+        return np.where(t > 0, t, np.inf)
+
+    return hit
+
+
+def look_at(eye, target):
+    z = np.asarray(target, float) - eye
+    z /= np.linalg.norm(z)
+    x = np.cross(z, [0, 0, 1])
+    x /= np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3] = np.stack([x, np.cross(z, x), z, eye], axis=1)
+    return T
+
+
+def orbit(n, radius=1.0, height=0.2, target=(0, 0, 0), arc_deg=360.0):
+    a = np.radians(np.arange(n) * arc_deg / n)
+    return np.stack([look_at([radius * np.cos(t), radius * np.sin(t), height], target) for t in a])
+
+
+def render(shapes, poses, camera=CAMERA, noise=NOISE, seed=0):
+    rng, rays = np.random.default_rng(seed), pixel_rays(camera)
+    images = []
+    for T in poses:
+        t = np.min([s(T[:3, 3], rays @ T[:3, :3].T) for s in shapes], axis=0)
+        z = t * rays[..., 2]
+        z = z + rng.normal(0, noise, z.shape) * np.where(np.isfinite(z), z, 0) ** 2
+        images.append(np.where(np.isfinite(z), np.round(z, 3), np.nan).astype(np.float32))
+    return images
+
+
+def stream(images, times=None):
+    n = len(images)
+    times = np.arange(n) / 15 if times is None else times
+    return Stream(times, lambda i: images[i], tuple(f"frame {i}" for i in range(n)), np.arange(n), np.ones(n, bool))
+
+
+def scan_of(images, **more):
+    return Scan("shapes", Path("shapes"), "memory", Rig(CAMERA), stream(images), **more)
+
+
+def fuse(images, poses, recipe=None, **more):
+    scan = scan_of(images)
+    return fuse_surface(scan, Trajectory(scan.depth.times_s, poses), load_recipe(recipe or RECIPE), **more)
+
+
+def closed(mesh):
+    """Every edge belongs to two triangles that run along it in opposite directions."""
+    t = mesh.triangles
+    e = np.concatenate([t[:, [0, 1]], t[:, [1, 2]], t[:, [2, 0]]])
+    forth, back = (np.unique(x, axis=0) for x in (e, e[:, ::-1]))
+    return len(forth) == len(e) and np.array_equal(forth, back)
+
+
+@pytest.fixture(scope="module")
+def ball() -> tuple[list, np.ndarray, FusionResult]:
+    """A 300 mm ball seen from a ring above and a ring below: all round."""
+    poses = np.concatenate([orbit(16, height=0.6), orbit(16, height=-0.6)])
+    images = render([sphere((0, 0, 0), 0.15)], poses)
+    return images, poses, fuse(images, poses)
+
+
+# ---------------------------------------------------------------- accuracy
+
+
+def test_a_ball_comes_out_round_closed_and_facing_outward(ball) -> None:
+    mesh = ball[2].mesh
+    radius = np.linalg.norm(mesh.vertices_m, axis=1)
+    error = np.abs(radius - 0.15)
+    assert error.mean() < 0.4e-3
+    assert np.percentile(error, 95) < 1.0e-3
+    assert closed(mesh)
+    outward = mesh.vertices_m / radius[:, None]
+    angle = np.degrees(np.arccos(np.clip((mesh.normals * outward).sum(1), -1, 1)))
+    assert angle.mean() < 1.5
+    assert np.percentile(angle, 99) < 4.0
+    np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-5)
+    face = meshing.triangle_normals(mesh.vertices_m, mesh.triangles)
+    assert ((face * outward[mesh.triangles[:, 0]]).sum(1) > 0).mean() > 0.999  # counter-clockwise from outside
+
+
+def test_a_pixel_centre_is_where_the_conventions_say() -> None:
+    """Seen from one side only, half a pixel of error (2 mm here) would shift the ball sideways by as much."""
+    poses = orbit(12, arc_deg=30, height=0.0)
+    result = fuse(render([sphere((0, 0, 0), 0.15)], poses, noise=0.3e-3), poses)
+    V = result.mesh.vertices_m.astype(float)
+    A = np.column_stack([2 * V, np.ones(len(V))])
+    centre = np.linalg.lstsq(A, (V**2).sum(1), rcond=None)[0][:3]
+    assert np.linalg.norm(centre) < 0.4e-3
+
+
+def test_no_memory_to_begin_with_costs_no_surface(ball) -> None:
+    """A grid that starts with room for a single block grows to the same surface as one with room for all."""
+    images, poses, expected = ball
+    scan, recipe = scan_of(images), load_recipe(RECIPE)
+    frames: Frames = DepthFrames(scan, recipe.input)
+    placed = depth_poses(scan, Trajectory(scan.depth.times_s, poses), 0.5)
+    survey = survey_depth(scan, frames, placed)
+    plan = plan_grid(scan, survey, recipe)
+    grid, _ = integrate_frames(survey, frames, placed, replace(plan, blocks=1), recipe, None)
+    V, F = meshing.canonical(*grid.extract(3))
+    assert grid.blocks == expected.blocks_used
+    assert closed(replace(expected.mesh, vertices_m=V, triangles=F))
+    np.testing.assert_array_equal(V, expected.mesh.vertices_m)
+    assert expected.blocks_used <= expected.blocks_estimated < 2 * expected.blocks_used
+
+
+def test_the_same_input_gives_the_same_bits(ball) -> None:
+    images, poses, first = ball
+    again = fuse(images, poses)
+    np.testing.assert_array_equal(first.mesh.vertices_m, again.mesh.vertices_m)
+    np.testing.assert_array_equal(first.mesh.triangles, again.mesh.triangles)
+    np.testing.assert_array_equal(first.mesh.normals, again.mesh.normals)
+
+
+def test_noise_is_found_in_the_data(ball) -> None:
+    assert depth_noise(ball[0]) == pytest.approx(NOISE, rel=0.1)
+    still = [np.round(d, 3) for d in render([plane(np.array([1.0, 0, 0]), 0)], orbit(2, arc_deg=20), noise=3e-3)]
+    assert depth_noise(still) == pytest.approx(3e-3, rel=0.1)
+
+
+# ---------------------------------------------------------------- floor, background
+
+
+PERSON = [
+    post(0, -0.12, 0.06, 0, 0.75),  # two legs on the floor z = 0 ...
+    post(0, 0.12, 0.06, 0, 0.75),
+    sphere((0, 0, 0.85), 0.25),  # ... and a trunk that joins them
+]
+FLOOR, WALL = plane(np.array([0, 0, 1.0]), 0), plane(np.array([-1.0, 0, 0]), 1.2)
+
+
+@pytest.fixture(scope="module")
+def standing() -> tuple[list, np.ndarray]:
+    poses = orbit(24, radius=1.5, height=1.1, target=(0, 0, 0.45))
+    # The wall is seen from one side of the walk only, else it would hide the subject.
+    shapes = [[*PERSON, FLOOR, *([WALL] if T[0, 3] < 0 else [])] for T in poses]
+    images = [render(s, [T], seed=i)[0] for i, (s, T) in enumerate(zip(shapes, poses, strict=True))]
+    return images, poses
+
+
+def test_the_floor_goes_and_the_feet_stay(standing) -> None:
+    images, poses = standing
+    result = fuse(images, poses, COARSE)
+    V = result.mesh.vertices_m
+    np.testing.assert_allclose(result.floor_plane, [0, 0, 1, 0], atol=4e-3)
+    trunk = np.linalg.norm(V - [0, 0, 0.85], axis=1) - 0.25
+    legs = np.hypot(V[:, :1], V[:, 1:2] - [-0.12, 0.12]) - 0.06
+    off = np.minimum(np.abs(trunk), np.abs(legs).min(1))
+    assert (off > 0.02).mean() < 0.002
+    for side in (V[:, 1] < 0, V[:, 1] > 0):
+        assert 0.008 < V[side, 2].min() < 0.022  # floor_clearance_mm = 12, and a voxel
+    reasons = {r.reason: r.area_cm2 for r in result.removed}
+    assert reasons["floor"] > 5000
+
+
+def test_floor_and_background_stay_if_asked(standing) -> None:
+    images, poses = standing
+    keep = {**COARSE, "subject": {"floor": "keep", "background": "keep"}}
+    V = fuse(images, poses, keep).mesh.vertices_m
+    assert (np.abs(V[:, 2]) < 0.01).mean() > 0.3
+    assert (np.abs(V[:, 0] - 1.2) < 0.02).any()
+
+
+def test_a_given_floor_is_refined_and_a_body_has_none(standing, ball) -> None:
+    images, poses = standing
+    tilted = np.array([0.01, 0, 1, 0.006])
+    result = fuse(images, poses, COARSE, floor_plane=tilted / np.linalg.norm(tilted[:3]))
+    np.testing.assert_allclose(result.floor_plane, [0, 0, 1, 0], atol=4e-3)
+    assert ball[2].floor_plane is None
+    asked = fuse(ball[0], ball[1], {**RECIPE, "subject": {"floor": "remove"}})
+    assert any("no floor" in m for m in asked.messages)
+    assert len(asked.mesh) == len(ball[2].mesh)
+
+
+def test_the_subject_is_what_was_looked_at_not_what_is_largest() -> None:
+    poses = orbit(24, height=0.3)
+    near, large = sphere((0, 0, 0), 0.12), sphere((-1.35, 0, 0), 0.5)
+    both = render([near, large], poses)
+    V = fuse(both, poses).mesh.vertices_m
+    assert np.abs(np.linalg.norm(V, axis=1) - 0.12).max() < 0.02
+
+
+# ---------------------------------------------------------------- memory, poses, faults
+
+
+def test_memory_bounds_the_grid_and_the_message_says_so(ball) -> None:
+    images, poses, free = ball
+    bound = free.memory_gib / 3
+    result = fuse(images, poses, {**RECIPE, "fusion": {"voxel_mm": 4, "max_memory_gib": bound}})
+    assert result.memory_gib <= bound
+    assert result.voxel_m > free.voxel_m
+    assert any("max_memory_gib" in m for m in result.messages)
+    with pytest.raises(ResourceError, match="GiB"):
+        fuse(images, poses, {**RECIPE, "fusion": {"voxel_mm": 4, "max_memory_gib": 1e-5}})
+
+
+def test_a_frame_that_tracking_lost_is_not_interpolated(ball) -> None:
+    images, poses, _ = ball
+    scan = scan_of(images)
+    has = np.arange(len(images)) != 7
+    own = Trajectory(scan.depth.times_s[has] + 2e-4, poses[has])
+    assert 7 not in depth_poses(scan, own, 0.5).frame
+    mocap = Trajectory(np.arange(200) * 0.0113, np.repeat(poses[:1], 200, 0))
+    assert len(depth_poses(scan, mocap, 0.5).frame) == len(images)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda d, T, t: (d, T, t + 100), ["pose", "clock"]),
+        (lambda d, T, t: ([x * 1000 for x in d], T, t), ["depth_unit_m", "1e+03"]),
+        (lambda d, T, t: ([x / 1000 for x in d], T, t), ["depth_unit_m"]),
+        (lambda d, T, t: ([x * np.nan for x in d], T, t), ["empty", "depth_unit_m"]),
+        (lambda d, T, t: (d, T * np.array([1, 1, 1, 1000])[None, None], t), ["m across", "metres"]),
+        (lambda d, T, t: (d, T * np.array([1, 1, 1, 20])[None, None], t), ["surface"]),
+    ],
+    ids=["no overlap", "depth in mm", "depth in km", "no depth", "poses in mm", "poses apart"],
+)
+def test_bad_input_is_one_clear_sentence(ball, change, words) -> None:
+    images, poses, _ = ball
+    scan = scan_of(images)
+    d, T, t = change(images, poses.copy(), scan.depth.times_s)
+    T[:, 3, 3] = 1
+    with pytest.raises(ScanError) as e:
+        fuse_surface(scan_of(d), Trajectory(t, T), load_recipe(RECIPE))
+    assert all(w in str(e.value) for w in words), e.value
+
+
+def test_one_frame_is_a_surface(ball) -> None:
+    images, poses, _ = ball
+    result = fuse(images[:1], poses[:1])
+    assert result.frames_used == 1
+    assert len(result.mesh) > 1000
+    assert np.isfinite(result.mesh.normals).all()
+
+
+# ---------------------------------------------------------------- colour
+
+
+def test_vertices_take_the_colour_painted_on_them(ball) -> None:
+    """A ball painted by direction, seen through a distorting lens beside the depth camera; one view spoilt."""
+    images, poses, plain = ball
+    T_color_depth = np.eye(4)
+    T_color_depth[0, 3] = -0.025
+    rays, hit = pixel_rays(LENS), sphere((0, 0, 0), 0.15)
+    photos = []
+    for T in poses:
+        W = T @ np.linalg.inv(T_color_depth)
+        d = rays @ W[:3, :3].T
+        t = hit(W[:3, 3], d)
+        n = (W[:3, 3] + np.where(np.isfinite(t), t, 0)[..., None] * d) / 0.15
+        photos.append(np.where(np.isfinite(t)[..., None], 128 + 100 * n, 255).astype(np.uint8))
+    photos[5] = np.full_like(photos[5], 0)
+    scan = replace(scan_of(images), rig=Rig(CAMERA, color=LENS, T_color_depth=T_color_depth), color=stream(photos))
+    mesh = fuse_surface(scan, Trajectory(scan.depth.times_s, poses), load_recipe(RECIPE)).mesh
+    np.testing.assert_array_equal(mesh.vertices_m, plain.mesh.vertices_m)
+    expected = 128 + 100 * mesh.vertices_m / np.linalg.norm(mesh.vertices_m, axis=1, keepdims=True)
+    off = np.abs(mesh.color_rgb.astype(float) - expected).max(1)
+    assert np.median(off) < 3
+    assert np.percentile(off, 99) < 10
+
+
+# ---------------------------------------------------------------- meshes
+
+
+def test_canonical_order_depends_on_the_shape_alone(ball) -> None:
+    mesh = ball[2].mesh
+    rng = np.random.default_rng(1)
+    shuffle = rng.permutation(len(mesh))
+    back = np.empty_like(shuffle)
+    back[shuffle] = np.arange(len(shuffle))
+    tri = np.roll(back[mesh.triangles], 1, axis=1)[rng.permutation(len(mesh.triangles))]
+    V, F = meshing.canonical(mesh.vertices_m[shuffle], tri)
+    np.testing.assert_array_equal(V, mesh.vertices_m)
+    np.testing.assert_array_equal(F, mesh.triangles)
+
+
+def test_pieces_areas_and_smoothing(ball) -> None:
+    mesh = ball[2].mesh
+    V = np.concatenate([mesh.vertices_m, mesh.vertices_m + np.float32([1, 0, 0])]).astype(np.float32)
+    F = np.concatenate([mesh.triangles, mesh.triangles + len(mesh)])
+    label = meshing.components(F, len(V))
+    assert len(np.unique(label)) == 2
+    kept, tri = meshing.keep_vertices(V, F, label == label[0])
+    np.testing.assert_array_equal(kept, mesh.vertices_m)
+    np.testing.assert_array_equal(tri, mesh.triangles)
+    assert meshing.vertex_areas(V, F).sum() == pytest.approx(2 * 4 * np.pi * 0.15**2, rel=0.03)
+    smooth = meshing.smooth_positions(kept, tri, 10)
+    error = [np.abs(np.linalg.norm(x, axis=1) - 0.15) for x in (kept, smooth)]
+    assert error[1].mean() < 0.9 * error[0].mean()
+    assert np.linalg.norm(smooth, axis=1).mean() == pytest.approx(0.15, abs=0.2e-3)  # Taubin does not shrink
+
+
+def test_window_normals_of_two_near_surfaces_do_not_mix() -> None:
+    """Two parallel sheets 5 mm apart, facing away from each other, like two fingers."""
+    g = np.arange(0, 0.1, 0.004)
+    x, y = np.meshgrid(g, g)
+    n = len(g)
+    i = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
+    F = np.concatenate([np.stack([i, i + 1, i + n + 1], 1), np.stack([i, i + n + 1, i + n], 1)])
+    top = np.stack([x.ravel(), y.ravel(), np.full(n * n, 0.0)], 1)
+    V = np.concatenate([top, top - [0, 0, 0.005]]).astype(np.float32)
+    both = np.concatenate([F, F[:, ::-1] + n * n]).astype(np.int32)
+    N = window_normals(V, both, 0.02)
+    assert (N[: n * n, 2] > 0.9).all()
+    assert (N[n * n :, 2] < -0.9).all()
+
+
+# ---------------------------------------------------------------- a recording
+
+
+def test_torso_recording_meets_its_bars(shared_data) -> None:
+    """Every third frame of the simulated torso, given poses, against its true surface."""
+    from thermofusion._open3d import o3d
+    from thermofusion.scans import open_scan
+
+    folder = shared_data("torso-dev")
+    scan = open_scan(folder)
+    third = Trajectory(scan.trajectory.times_s[::3], scan.trajectory.T_world_depth[::3])
+    result = fuse_surface(scan, third, load_recipe("torso"))
+    assert result.frames_used == 60
+    truth = np.load(folder / "truth" / "surface.npz")
+    surface = o3d.t.geometry.RaycastingScene()
+    surface.add_triangles(truth["vertices_m"], truth["triangles"].astype(np.uint32))
+    near = surface.compute_closest_points(o3d.core.Tensor(result.mesh.vertices_m))
+    off = np.linalg.norm(result.mesh.vertices_m - near["points"].numpy(), axis=1)
+    assert (off > 0.02).mean() < 0.002
+    assert off.mean() < 0.35e-3
+    assert np.percentile(off, 95) < 0.9e-3
+    cos = (result.mesh.normals * near["primitive_normals"].numpy()).sum(1)
+    assert np.median(np.degrees(np.arccos(np.clip(cos, -1, 1)))) < 1.8  # the truth's own facets differ by 1° from it
+    assert result.mesh.color_rgb is not None
+    skin = result.mesh.color_rgb[(result.mesh.color_rgb != 128).any(1)]
+    assert len(skin) > 0.8 * len(result.mesh)
