@@ -1,7 +1,7 @@
 """PLY, binary little-endian: for CloudCompare (`scalar_*`), MeshLab (`quality`), Blender, Open3D, Python.
 
 The description stands in comment lines, `comment thermofusion <key> <JSON>`; a long value goes on in further lines of
-the same key (rply and vcglib refuse lines of 1024 characters and more). Colours: sRGB bytes.
+the same key (MeshLab's reader refuses header lines of about 500 characters). Colours: sRGB bytes.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from .files import read_array, read_whole, write_whole
 XYZ, NORMAL, RGB = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
 QUALITY = "quality"  # = scalar_temperature, for MeshLab
 FACE = np.dtype([("n", "u1"), ("v", "<i4", 3)])
-COMMENT_CHARACTERS = 800
+COMMENT_CHARACTERS = 200
 _NUMBERS = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
 _NUMBERS |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
 _NUMBERS |= {"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}
