@@ -27,7 +27,8 @@ from .types import Camera, Float, Float32, Scan, SurfaceMesh, Trajectory
 
 MAX_VIEWS = 30
 MAX_POINTS = 400  # contour points used in a view
-REACH_DEG = (1.6, 1.0, 0.7, 0.5, 0.5, 0.5)  # how far from the prediction an edge is looked for, by iteration
+REACH_DEG = (1.6, 1.0, 0.7) + (0.5,) * 9  # how far from the prediction an edge is looked for, by iteration
+AT_REST = 0.1  # of a sigma: a smaller step ends the iterations
 MIN_REACH_PX = 3.0
 PRIOR_ROTATION_DEG = 0.7  # of a calibrated rig that was handled since
 PRIOR_TRANSLATION_M = 0.004
@@ -264,7 +265,7 @@ def _refine(views: _Views, start: _State, contrast: _Contrast) -> AlignmentResul
     cov = solved.covariance[:7, :7] + _shared_error(views)
     chi2 = float(change @ np.linalg.solve(cov, change))
     supported = chi2 > SUPPORT_CHI2 and after < before
-    converged = solved.rest < 0.5
+    converged = solved.rest < AT_REST
     angle, shift = np.degrees(np.linalg.norm(change[:3])), 1e3 * np.linalg.norm(change[3:6])
     found = f"rig {angle:.2f}° and {shift:.1f} mm, clock {1e3 * change[6]:+.1f} ms from the scan's own"
     result = AlignmentResult(
@@ -314,6 +315,8 @@ def _solve(views: _Views, start: _State, contrast: _Contrast) -> _Solved | None:
         cov = np.asarray(np.linalg.inv(information + prior), np.float64)
         rest = float(np.max(np.abs(step) / np.sqrt(np.diag(cov))))
         solved = _Solved(state, cov, scale, int((weight > 0).sum()), rest)
+        if reach_deg == REACH_DEG[-1] and rest < AT_REST:
+            break
     return solved
 
 

@@ -23,6 +23,7 @@ BISECTIONS = 6  # of one grid step: below a tenth of a pixel
 EDGE_ON_COS = 0.5  # an occluding contour is seen edge-on; noisy, window-averaged normals are up to 30° off
 PROFILE_STEP_PX = 0.5
 BLUR_SIGMA_PX = 1.0  # of the image before its steepest step is looked for: noise of the derivative
+CLIMB = 4  # steps from a preferred place on an edge to its top
 FLANK_PX = 4.0  # the step's height is taken this far on both sides
 
 
@@ -162,14 +163,16 @@ def find_edges(smooth: Float32, contour: ProjectedContour, reach_px: float, sign
     fall = (profile[:, :-2] - profile[:, 2:]) / (2 * PROFILE_STEP_PX)
     strength = np.abs(fall) if sign == 0 else sign * fall
     s_fall = s[1:-1]
-    # A nearer edge is the likelier one: a gentle preference only, edges at the reach count half.
-    prefer = 1 / (1 + (s_fall / reach_px) ** 2)
-    strength = np.where(np.abs(s_fall) <= reach_px, strength * prefer, -np.inf)
-    whole = np.isfinite(profile).all(1)
-    peak = np.where(whole, np.argmax(np.where(np.isfinite(strength), strength, -np.inf), axis=1), 1)
-    row = np.arange(len(profile))
+    # A nearer edge is the likelier one, so it is preferred, gently; its place is where the image itself is steepest.
+    prefer = np.where(np.abs(s_fall) <= reach_px, 1 / (1 + (s_fall / reach_px) ** 2), 0.0)
+    whole = np.asarray(np.isfinite(profile).all(1))
+    strength = np.where(whole[:, None], strength, 0.0)
+    peak, row, last = np.argmax(strength * prefer, axis=1), np.arange(len(profile)), len(s_fall) - 1
+    for _ in range(CLIMB):
+        around = np.stack([np.clip(peak + d, 0, last) for d in (-1, 0, 1)])
+        peak = around[np.argmax(strength[row, around], axis=0), row]
     inside_reach = np.abs(s_fall[peak]) < reach_px - PROFILE_STEP_PX
-    left, mid, right = (np.abs(fall[row, np.clip(peak + d, 0, len(s_fall) - 1)]) for d in (-1, 0, 1))
+    left, mid, right = (strength[row, np.clip(peak + d, 0, last)] for d in (-1, 0, 1))
     with np.errstate(invalid="ignore", divide="ignore"):
         shift = np.clip(0.5 * (left - right) / (left - 2 * mid + right), -1, 1)
     offset = s_fall[peak] + np.where(np.isfinite(shift), shift, 0.0) * PROFILE_STEP_PX

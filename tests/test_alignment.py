@@ -1,0 +1,236 @@
+"""Rig and clock found from outlines: a bumpy warm body walked round by a cheap, distorted thermal camera."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from thermofusion._open3d import o3d
+from thermofusion.alignment import PRIOR_TIME_S, AlignmentResult, align_thermal
+from thermofusion.errors import ScanError
+from thermofusion.geometry import interpolate_trajectory, invert, pixel_rays, pose, se3_exp, se3_log
+from thermofusion.recipe import load_recipe
+from thermofusion.scans import open_scan
+from thermofusion.types import Camera, Rig, Scan, SignalCurve, Stream, SurfaceMesh, ThermalSensor, Trajectory
+
+ROOM_DEGC, SKIN_DEGC, NETD_K = 22.0, 33.0, 0.06
+THERMAL = Camera(
+    320, 240, np.array([[300.0, 0, 161], [0, 305, 121], [0, 0, 1]]), np.array([-0.2, 0.08, 1e-3, -5e-4, 0])
+)
+DEPTH = Camera(640, 480, np.array([[590.0, 0, 319.5], [0, 590, 239.5], [0, 0, 1]]))
+FINE_RAYS = pixel_rays(
+    THERMAL, *np.meshgrid(np.arange(-0.25, 319.5, 0.5), np.arange(-0.25, 239.5, 0.5))
+)  # 2 x 2 a pixel
+T_THERMAL_DEPTH = se3_exp(np.array([0.05, 0.02, -0.01, 0.02, -0.1, 0.01]))
+
+
+def ellipsoid(n: int = 140) -> SurfaceMesh:
+    """A body-sized ellipsoid with bumps of a centimetre; normals of the mesh."""
+    polar, azimuth = np.meshgrid(np.linspace(0.01, np.pi - 0.01, n), np.linspace(0, 2 * np.pi, 2 * n), indexing="ij")
+    d = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], -1)
+    radius = 1 + 0.06 * np.sin(5 * azimuth) * np.sin(polar) ** 2 + 0.05 * np.sin(7 * polar)
+    p = (d * radius[..., None] * [0.22, 0.15, 0.38]).reshape(-1, 3).astype(np.float32)
+    i = np.arange(n * 2 * n).reshape(n, 2 * n)
+    a, b, c, e = (x.ravel() for x in (i[:-1, :-1], i[1:, :-1], i[1:, 1:], i[:-1, 1:]))
+    triangles = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, e], 1)]).astype(np.int32)
+    mesh = o3d.t.geometry.TriangleMesh(o3d.core.Tensor(p), o3d.core.Tensor(triangles))
+    mesh.compute_vertex_normals()
+    return SurfaceMesh(p, triangles, mesh.vertex.normals.numpy())
+
+
+def walk(duration_s: float = 8.0, tremor: float = 1.0) -> Trajectory:
+    """Once round at 1.1 m, looking at the middle, with the unsteadiness of a hand (1 cm, 1°)."""
+    t = np.arange(0, duration_s, 1 / 15)
+    phase = 2 * np.pi * t / duration_s
+    eye = 1.1 * np.stack([np.cos(phase), np.sin(phase), 0.1 * np.sin(2 * phase)], -1)
+    z = -eye / np.linalg.norm(eye, axis=1, keepdims=True)
+    x = np.cross(z, [0, 0, 1.0])
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    R = np.stack([x, np.cross(z, x), z], 2)
+    rate = np.array([1.1, 1.7, 0.9, 1.3, 0.7, 1.9]) * 2 * np.pi
+    shake = tremor * np.sin(rate * t[:, None] + np.arange(6)) * ([0.01] * 3 + [0.008] * 3)
+    return Trajectory(t, np.stack([pose(r, e) for r, e in zip(R, eye, strict=True)]) @ se3_exp(shake))
+
+
+def render(mesh: SurfaceMesh, T_world_thermal: np.ndarray, skin_degC: float, seed: int) -> np.ndarray:
+    """What the camera reports, °C: 2 x 2 rays a pixel, emissivity falling at the limb, point spread, noise, offset."""
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(o3d.core.Tensor(mesh.vertices_m), o3d.core.Tensor(mesh.triangles.astype(np.uint32)))
+    rays = FINE_RAYS @ T_world_thermal[:3, :3].T
+    eye = np.broadcast_to(T_world_thermal[:3, 3], rays.shape)
+    answer = scene.cast_rays(o3d.core.Tensor(np.concatenate([eye, rays], -1).astype(np.float32)))
+    t = answer["t_hit"].numpy()
+    hit = np.isfinite(t)
+    p = eye + np.where(hit, t, 0)[..., None] * rays
+    cos = np.abs((answer["primitive_normals"].numpy() * rays).sum(-1))
+    pattern = skin_degC + (skin_degC != ROOM_DEGC) * np.sin(12 * p[..., 0] + 3) * np.cos(15 * p[..., 2])
+    emissivity = 0.98 * (1 - (1 - cos) ** 5)
+    image = np.where(hit, ROOM_DEGC + emissivity * (pattern - ROOM_DEGC), ROOM_DEGC)
+    image = image.reshape(240, 2, 320, 2).mean((1, 3))
+    noise = np.random.default_rng(seed).normal(0, NETD_K, image.shape)
+    return (cv2.GaussianBlur(image, (0, 0), 0.8) + noise + 0.5 * np.sin(seed)).astype(np.float32)
+
+
+def make_scan(mesh: SurfaceMesh, trajectory: Trajectory, *, skin_degC: float = SKIN_DEGC, clock_s: float = 0.0) -> Scan:
+    """24 thermal frames; each is stamped `clock_s` later than it was taken."""
+    taken = np.linspace(0.3, trajectory.times_s[-1] - 0.3, 24)
+    T_world_depth, _ = interpolate_trajectory(trajectory, taken)
+    images = [render(mesh, T @ invert(T_THERMAL_DEPTH), skin_degC, i) for i, T in enumerate(T_world_depth)]
+    places, index = tuple(f"thermal {i}" for i in range(24)), np.arange(24)
+    thermal = Stream(taken + clock_s, lambda i: images[i], places, index, np.ones(24, bool))
+    depth = Stream(np.zeros(0), lambda i: np.zeros(0), (), np.zeros(0, np.int64), np.zeros(0, bool))
+    sensor = ThermalSensor(SignalCurve("apparent_degC"), netd_K=NETD_K)
+    return Scan(
+        "ellipsoid", Path(), "made", Rig(DEPTH, THERMAL, T_THERMAL_DEPTH), depth, thermal=thermal, sensor=sensor
+    )
+
+
+def turned(scan: Scan, rotation_deg: list[float], translation_m: tuple[float, ...] = (0, 0, 0)) -> Scan:
+    T = se3_exp(np.array([*np.radians(rotation_deg), *translation_m])) @ scan.rig.T_thermal_depth
+    return replace(scan, rig=replace(scan.rig, T_thermal_depth=T))
+
+
+def delayed(scan: Scan, seconds: float) -> Scan:
+    return replace(scan, thermal=replace(scan.thermal, times_s=scan.thermal.times_s + seconds))
+
+
+def errors(result: AlignmentResult, truth: np.ndarray) -> tuple[float, float]:
+    """Rotation [deg] and translation [m] from the truth."""
+    twist = se3_log(result.T_thermal_depth @ invert(truth))
+    return float(np.degrees(np.linalg.norm(twist[:3]))), float(np.linalg.norm(twist[3:]))
+
+
+def inside_covariance(result: AlignmentResult, time_offset_s: float = 0.0) -> bool:
+    """Whether the truth lies within 99.9 % of the stated covariance (chi-square with 7 degrees of freedom)."""
+    twist = se3_log(T_THERMAL_DEPTH @ invert(result.T_thermal_depth))
+    error = np.append(twist, time_offset_s - result.time_offset_s)
+    return bool(error @ np.linalg.solve(result.covariance, error) < 24.3)
+
+
+@pytest.fixture(scope="module")
+def body() -> SurfaceMesh:
+    return ellipsoid()
+
+
+@pytest.fixture(scope="module")
+def scan(body) -> Scan:
+    return make_scan(body, walk())
+
+
+RECIPE = load_recipe({})
+
+
+@pytest.mark.parametrize(
+    ("rotation_deg", "translation_m", "clock_s"),
+    [
+        ([0.3, -0.3, 0.26], (0, 0, 0), 0.04),
+        ([-0.5, 0, 0], (0.003, -0.002, 0.002), -0.04),
+        ([0, 0.5, 0], (0, 0, 0), 0.04),
+    ],
+)
+def test_wrong_rig_and_clock_are_found(body, scan, rotation_deg, translation_m, clock_s):
+    wrong = delayed(turned(scan, rotation_deg, translation_m), clock_s)
+    result = align_thermal(wrong, body, walk(), RECIPE)
+    rotation, translation = errors(result, T_THERMAL_DEPTH)
+    assert result.changed
+    assert result.converged
+    assert rotation < 0.1
+    assert translation < 4e-3
+    assert result.time_offset_s == pytest.approx(-clock_s, abs=0.002)
+    assert result.residual_px_after < 0.2 * result.residual_px_before
+    assert inside_covariance(result, -clock_s)
+
+
+def test_right_rig_is_left_alone(body, scan):
+    result = align_thermal(scan, body, walk(), RECIPE)
+    assert not result.changed
+    np.testing.assert_array_equal(result.T_thermal_depth, scan.rig.T_thermal_depth)
+    assert result.time_offset_s == 0
+    assert "left alone" in result.messages[0]
+    assert result.residual_px_before == pytest.approx(result.residual_px_after)
+    assert result.residual_px_before < 0.3
+
+
+def test_the_sensors_own_offset_is_the_start(body, scan):
+    """A clock shift that scan.json already declares is none."""
+    declared = replace(delayed(scan, 0.25), sensor=replace(scan.sensor, time_offset_s=-0.25))
+    result = align_thermal(declared, body, walk(), RECIPE)
+    assert not result.changed
+    assert result.time_offset_s == -0.25
+
+
+def test_cold_body_in_a_warm_room(body):
+    cold = make_scan(body, walk(), skin_degC=10.0)
+    result = align_thermal(turned(cold, [0.2, 0.3, -0.2]), body, walk(), RECIPE)
+    assert errors(result, T_THERMAL_DEPTH)[0] < 0.1
+
+
+def test_nothing_to_see_says_so(body):
+    blank = turned(make_scan(body, walk(), skin_degC=ROOM_DEGC), [0.5, 0, 0])
+    result = align_thermal(blank, body, walk(), RECIPE)
+    assert not result.changed
+    assert not result.converged
+    np.testing.assert_array_equal(result.T_thermal_depth, blank.rig.T_thermal_depth)
+    assert "does not stand out" in result.messages[0]
+    assert result.sigma_time_s == PRIOR_TIME_S
+
+
+def test_cut_end_of_the_model_is_no_outline(body, scan):
+    """The upper half fused only: the body goes on below the cut, and the rig must not follow the cut."""
+    keep = body.vertices_m[body.triangles].mean(1)[:, 2] > -0.05
+    half = SurfaceMesh(body.vertices_m, body.triangles[keep], body.normals)
+    result = align_thermal(turned(scan, [0.3, -0.3, 0.26]), half, walk(), RECIPE)
+    assert result.residual_px_after < 0.3
+    assert inside_covariance(result)
+    assert not result.changed or errors(result, T_THERMAL_DEPTH)[0] < 0.25  # one end less to hold the vertical
+
+
+def test_model_swollen_by_fusion_moves_only_the_nuisance(body, scan):
+    """2 mm of common swelling is 0.5 px: it goes into the outline's width, not into the rig."""
+    swollen = SurfaceMesh(body.vertices_m + np.float32(0.002) * body.normals, body.triangles, body.normals)
+    result = align_thermal(turned(scan, [0.3, -0.3, 0.26]), swollen, walk(), RECIPE)
+    assert errors(result, T_THERMAL_DEPTH)[0] < 0.1
+    assert result.outline_width_px < -0.4
+
+
+def test_steady_walk_leaves_the_clock_uncertain(body, scan):
+    """Along a constant twist a clock error is a rig error: the covariance must not claim to know either."""
+    steady_walk = walk(tremor=0.0)
+    steady = make_scan(body, steady_walk)
+    shaky = align_thermal(delayed(scan, 0.04), body, walk(), RECIPE)
+    result = align_thermal(delayed(steady, 0.04), body, steady_walk, RECIPE)
+    assert result.sigma_time_s > 2 * shaky.sigma_time_s
+    assert abs(result.time_offset_s + 0.04) < 4 * result.sigma_time_s
+
+
+def test_same_input_same_result_and_switches(body, scan):
+    wrong = turned(scan, [0.3, 0, 0])
+    first, second = (align_thermal(wrong, body, walk(), RECIPE) for _ in range(2))
+    np.testing.assert_array_equal(first.T_thermal_depth, second.T_thermal_depth)
+    off = align_thermal(wrong, body, walk(), load_recipe({"crosscal": {"align": False}}))
+    assert not off.changed
+    assert "recipe" in off.messages[0]
+    with pytest.raises(ScanError, match="no thermal stream"):
+        align_thermal(replace(scan, thermal=None), body, walk(), RECIPE)
+
+
+@pytest.mark.parametrize(("rotation_deg", "clock_s"), [([0.3, -0.3, 0.26], 0.04), ([0.0, 0.5, 0.0], -0.04)])
+def test_torso_recording(shared_data, rotation_deg, clock_s):
+    """The simulated walk round a person with its true surface: half a degree and 40 ms are found."""
+    root = shared_data("torso-dev")
+    truth = np.load(root / "truth" / "surface.npz")
+    mesh = o3d.t.geometry.TriangleMesh(o3d.core.Tensor(truth["vertices_m"]), o3d.core.Tensor(truth["triangles"]))
+    mesh.compute_vertex_normals()
+    surface = SurfaceMesh(truth["vertices_m"], truth["triangles"], mesh.vertex.normals.numpy())
+    rows = np.loadtxt(root / "truth" / "trajectory.txt")
+    R = Rotation.from_quat(rows[:, 4:8]).as_matrix()
+    trajectory = Trajectory(rows[:, 0], np.stack([pose(r, p) for r, p in zip(R, rows[:, 1:4], strict=True)]))
+    wrong = delayed(turned(open_scan(root), rotation_deg), clock_s)
+    result = align_thermal(wrong, surface, trajectory, RECIPE)
+    assert errors(result, truth["T_thermal_depth"])[0] < 0.1
+    assert result.time_offset_s == pytest.approx(-clock_s, abs=0.010)
