@@ -34,6 +34,7 @@ MAX_NEIGHBOURS = 100  # in a plane fit
 PLANE_AGREES_COS = 0.8  # 37°: a plane fit farther from the mesh's own normal caught another part of the body
 SEEN_TRUNCATIONS = 2.0  # a vertex is on a frame's surface if nearer to it than this, in truncations
 VOTE_SHARE = 0.05  # of what a frame sees; less is a hand in front or a chair's leg
+MAX_PLANES = 3  # a floor and two walls
 MAX_WALK_M = 100.0  # a camera path longer across than this is in another unit
 
 
@@ -196,24 +197,50 @@ def _clean(
 ) -> tuple[Float32, Int, Float | None, tuple[RemovedPart, ...], tuple[str, ...]]:
     """The subject's surface alone: without floor, background and specks."""
     subject, removed, messages = recipe.subject, [], []
-    plane = None
+    floor: Float | None = None
+    walls: list[Float] = []
     if subject.floor != "keep":
-        areas = meshing.vertex_areas(vertices, triangles)
-        normals = meshing.mesh_normals(vertices, triangles)
-        eyes = survey.T_world_depth[:, :3, 3]
-        if floor_plane is not None:
-            plane = meshing.refine_floor(vertices, normals, areas, eyes, np.asarray(floor_plane, np.float64))
-        if plane is None:
-            plane = meshing.find_floor(vertices, normals, areas, eyes)
-        if plane is None and subject.floor == "remove":
+        floor, walls = _planes(vertices, triangles, survey, subject.floor_clearance_mm / 1e3, floor_plane)
+        if floor is None and subject.floor == "remove":
             messages.append("no floor plane was found, none was removed")
-    if plane is not None:
-        height = vertices @ plane[:3].astype(np.float32) + np.float32(plane[3])
-        stays = height >= subject.floor_clearance_mm / 1e3
-        removed.append(RemovedPart("floor", 1e4 * float(areas[~stays].sum()), 1))
+    planes = [("floor", floor)] if floor is not None else []
+    planes += [("wall", w) for w in walls] if subject.background == "remove" else []
+    for reason, plane in planes:
+        stays = _height(plane, vertices) >= subject.floor_clearance_mm / 1e3
+        removed.append(RemovedPart(reason, 1e4 * float(meshing.vertex_areas(vertices, triangles)[~stays].sum()), 1))
         vertices, triangles = meshing.keep_vertices(vertices, triangles, stays)
     vertices, triangles, others = _pieces(vertices, triangles, survey, plan, recipe)
-    return vertices, triangles, plane, (*removed, *others), tuple(messages)
+    return vertices, triangles, floor, (*removed, *others), tuple(messages)
+
+
+def _height(plane: Float, points: Float32) -> Float32:
+    return points @ plane[:3].astype(np.float32) + np.float32(plane[3])
+
+
+def _planes(
+    vertices: Float32, triangles: Int, survey: Survey, clearance_m: float, floor: Float | None
+) -> tuple[Float | None, list[Float]]:
+    """The floor (given or found), and other planes that bound the scene: walls.
+
+    Of several planes the floor is the one that faces up as the cameras were held.
+    """
+    areas, normals = meshing.vertex_areas(vertices, triangles), meshing.mesh_normals(vertices, triangles)
+    eyes, up = survey.T_world_depth[:, :3, 3], -survey.T_world_depth[:, :3, 1].mean(0)
+    found: list[Float] = []
+    if floor is not None:
+        floor = meshing.refine_floor(vertices, normals, areas, eyes, np.asarray(floor, np.float64))
+    plane = floor
+    for _ in range(MAX_PLANES):
+        if plane is None:
+            plane = meshing.find_floor(vertices, normals, areas, eyes)
+        if plane is None:
+            break
+        found.append(plane)
+        rest = _height(plane, vertices) >= clearance_m
+        vertices, normals, areas, plane = vertices[rest], normals[rest], areas[rest], None
+    if floor is None and found:
+        floor = max(found, key=lambda p: float(p[:3] @ up))
+    return floor, [p for p in found if p is not floor]
 
 
 def _pieces(

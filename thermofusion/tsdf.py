@@ -21,7 +21,7 @@ from .types import Camera, Float, Float32, Scan
 
 BLOCK = 8  # voxels along the edge of a block
 BYTES_PER_BLOCK = BLOCK**3 * (8 + 16)  # tsdf and weight, plus the table that mesh extraction builds
-SURVEY_FRAMES = 16  # enough for ranges, noise and extent; a tenth of a second
+SURVEY_FRAMES, SURVEY_SHARE = 16, 1 / 12  # enough for ranges, noise and extent
 NOISE_M_AT_1M = 1.425e-3  # Kinect v1 depth noise is about this times z² (Khoshelham & Elberink 2012)
 NOISE_BOUNDS = (0.4e-3, 6e-3)  # of the coefficient estimated from the data
 VOXEL_PER_NOISE, VOXEL_PER_FOOTPRINT = 1.8, 0.8  # finer voxels than this hold noise, or what no thermal pixel resolves
@@ -83,8 +83,9 @@ class GridPlan:
 
 
 def survey_depth(scan: Scan, frames: Frames, poses: FramePoses) -> Survey:
-    """Look at up to 16 frames, evenly spread. Raises ScanError if none holds depth within the recipe's range."""
-    pick = np.unique(np.linspace(0, len(poses.frame) - 1, SURVEY_FRAMES).astype(int))
+    """Look at a few frames, evenly spread. Raises ScanError if none holds depth within the recipe's range."""
+    count = int(np.clip(SURVEY_SHARE * len(poses.frame), SURVEY_FRAMES, 4 * SURVEY_FRAMES))
+    pick = np.unique(np.linspace(0, len(poses.frame) - 1, count).astype(int))
     depth = tuple(d for _, d in frames.read_ahead(poses.frame[pick].tolist()))
     ranges = np.concatenate([d[::4, ::4].ravel() for d in depth])
     ranges = ranges[np.isfinite(ranges)]
@@ -204,8 +205,8 @@ class VoxelGrid:
         K[:2, 2] += 0.5
         self._K = o3d.core.Tensor(K)
         self._multiplier = plan.truncation_m / plan.voxel_m
-        # Open3D looks for blocks along every fourth pixel's ray. A coarse image is enlarged for that: else the corner of
-        # a block slips through between rays in most frames, and is a hole in the end.
+        # Open3D looks for blocks along every fourth pixel's ray. A coarse image is enlarged for that: else the corner
+        # of a block slips through between rays in most frames, and is a hole in the end.
         stride_m = TOUCH_STRIDE_PX * survey.median_range_m / survey.camera.focal_px
         self._enlarge = max(1, int(np.ceil(TOUCHES_PER_BLOCK * stride_m / (BLOCK * plan.voxel_m))))
         K_touch = K.copy()
