@@ -6,8 +6,9 @@ inverse-variance weights and a robust loss; the others are what the field does, 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +16,9 @@ from scipy.sparse import csc_matrix
 
 from .crosscal import CrosscalResult
 from .emissivity import EmissivityModel, follows_shape
-from .overlap import TUKEY
 from .radiometry import ZERO_DEGC_K, Band, leaving_radiance, paper_chain
 from .recipe import RadiometrySection
+from .robustmean import RobustMean, chunks, vertex_sums
 from .types import Bool, Float, Float32, Int, Observations, OutputMode
 from .uncertainty import (
     AngleTables,
@@ -30,9 +31,7 @@ from .uncertainty import (
     vertex_uncertainty,
 )
 
-CHUNK = 1_000_000  # rows worked on at once: bounds memory whatever the scan
-L1_STEPS, TUKEY_STEPS = 4, 3
-L1_FLOOR = 0.3  # of one sigma: below it the L1 start is quadratic
+BLOCK = 12_000_000  # rows held in copies at once: larger scans are blended by blocks of vertices
 MODES = 10  # of the calibration's covariance that are followed to each vertex
 FACING_DEG = 15.0  # what counts as straight on for the paper's S
 
@@ -58,6 +57,15 @@ class BlendResult:
     distance_m: Float32
     residual: Float32
     spread_K: Float32
+
+    @classmethod
+    def joined(cls, blocks: Sequence[BlendResult]) -> BlendResult:
+        """Blocks of vertices, one after the other."""
+        names = [f for f in cls.__dataclass_fields__ if f not in ("output", "uncertainty")]
+        arrays = {name: np.concatenate([getattr(b, name) for b in blocks]) for name in names}
+        parts = blocks[0].uncertainty.parts_K
+        joined = {k: np.concatenate([b.uncertainty.parts_K[k] for b in blocks]) for k in parts}
+        return cls(output=blocks[0].output, uncertainty=Uncertainty.of(joined), **arrays)
 
     @property
     def temperature_K(self) -> Float:
@@ -104,52 +112,102 @@ def blend(
     reflected_K : temperature of the room's reflection (the paper's T_a). air_K : of the air, for the budget.
     """
     settings, errors = settings or RadiometrySection(), errors or ErrorModel()
-    joint = settings.method == "joint"
-    calibration = calibration if joint else None
-    model = calibration.emissivity(emissivity) if calibration else emissivity
-    usable, oblique, count = _usable(observations, n_vertices, max_angle_deg, last_resort_angle_deg)
-    rows = observations if usable.all() else observations.select(usable)
+    calibration = calibration if settings.method == "joint" else None
+    task = _Task(
+        calibration=calibration,
+        given=emissivity,
+        model=calibration.emissivity(emissivity) if calibration else emissivity,
+        band=band,
+        reflected_K=reflected_K,
+        air_K=air_K,
+        settings=settings,
+        slope_L=calibration.slope_L if calibration else skin_slope(band, observations.radiance),
+        paper_S=_paper_scale(observations, emissivity, band, reflected_K) if settings.method == "paper" else 1.0,
+        angles_deg=(max_angle_deg, max(last_resort_angle_deg, max_angle_deg)),
+    )
     L_r = np.broadcast_to(np.asarray(L_reflected, np.float64), (n_vertices,))
-    best, distance = _best(rows, n_vertices)
-    apparent = _mean(rows, rows.radiance, 1 / rows.footprint_m2, n_vertices)
+    gradient = np.broadcast_to(np.asarray(errors.gradient_K_per_m, np.float32), (n_vertices,))
+    blocks = max(1, -(-len(observations) // BLOCK))
+    edges = np.linspace(0, n_vertices, blocks + 1).astype(int)
+    results = []
+    for lo, hi in pairwise(edges):
+        rows = observations
+        if blocks > 1:
+            rows = observations.select(np.flatnonzero((rows.vertex >= lo) & (rows.vertex < hi)))
+            rows = replace(rows, vertex=rows.vertex - np.int32(lo))
+        results.append(_blend(rows, L_r[lo:hi], task, replace(errors, gradient_K_per_m=gradient[lo:hi])))
+    return results[0] if blocks == 1 else BlendResult.joined(results)
 
-    if settings.method in ("nearest-view", "paper"):
-        pick = _pick(rows, n_vertices, rows.range_m if settings.method == "nearest-view" else -rows.cos_angle)
-        raw = np.full(n_vertices, np.nan)
-        raw[rows.vertex[pick]] = rows.radiance[pick]
-        L0 = raw
-        if settings.method == "paper":
-            L0 = _paper(rows.select(pick), raw, emissivity, band, reflected_K)
-        L_s = L0
-        system = None
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """What a blend needs besides observations: the same for all blocks of vertices."""
+
+    calibration: CrosscalResult | None
+    given: EmissivityModel  # the recipe's
+    model: EmissivityModel  # with the fitted shape
+    band: Band
+    reflected_K: float
+    air_K: float | None
+    settings: RadiometrySection
+    slope_L: float
+    paper_S: float
+    angles_deg: tuple[float, float]
+
+
+def _blend(rows: Observations, L_r: Float, task: _Task, errors: ErrorModel) -> BlendResult:
+    """`blend` of one block of vertices, numbered from 0."""
+    V, method, band = len(L_r), task.settings.method, task.band
+    usable, oblique, count = _usable(rows, V, *task.angles_deg)
+    rows = rows if usable.all() else rows.select(usable)
+    best, distance = _best(rows, V)
+    apparent = _mean(rows, rows.radiance, 1 / rows.footprint_m2, V)
+    if method in ("nearest-view", "paper"):
+        pick = _pick(rows, V, rows.range_m if method == "nearest-view" else -rows.cos_angle)
+        L0 = L_s = _single(rows.select(pick), V, task)
+        residual = spread = np.full(V, np.nan, np.float32)
+        uncertainty = Uncertainty.of({"noise": np.where(np.isnan(L_s), np.nan, errors.netd_K)})
     else:
-        system = _System.build(rows, n_vertices, calibration, model, L_r, settings, errors, band)
-        x = system.solve(robust=joint)
-        L0 = L_r + x
-        L_s = L_r + x / (model.normal if system.angle_corrected else 1.0)
+        system = _robust_mean(rows, L_r, task, errors)
+        x = system.solve(robust=method == "joint")
+        L0, L_s = L_r + x, L_r + x / system.epsilon0
+        residual, spread = system.scatter(x)
+        uncertainty = _uncertainty(rows, system, x, band.temperature_K(L_s), distance, spread, task, errors)
+    T0, T_s, T_app = (band.temperature_K(L) for L in (L0, L_s, apparent))
+    return BlendResult(
+        task.settings.output, T_s, T0, T_app, uncertainty, count, oblique, best, distance, residual, spread
+    )
 
-    T0, Ts, T_app = band.temperature_K(L0), band.temperature_K(L_s), band.temperature_K(apparent)
-    residual, spread = system.scatter(x) if system else (np.full(n_vertices, np.nan, np.float32),) * 2
-    uncertainty = Uncertainty.of({"noise": np.where(np.isnan(Ts), np.nan, errors.netd_K)})
-    if system:
-        uncertainty = vertex_uncertainty(
-            _levers(rows, system, x, calibration, model, errors),
-            x,
-            Ts,
-            epsilon0=model.normal if system.angle_corrected else 1.0,
-            absolute=settings.output == "absolute" and system.angle_corrected,
-            slope_L=calibration.slope_L if calibration else skin_slope(band, rows.radiance),
-            slope_reflected=float(band.d_radiance_dT(reflected_K)),
-            errors=errors,
-            shape_fitted=bool(calibration and calibration.shape_sigma > 0),
-            epsilon0_follows=bool(calibration and calibration.shape_sigma > 0 and follows_shape(emissivity)),
-            reference_sigma_K=calibration.reference_sigma_K if calibration else np.nan,
-            air_K=air_K,
-            transmission_per_m=settings.transmission_per_m,
-            range_m=distance,
-            views_K=None if calibration else spread,
-        )
-    return BlendResult(settings.output, Ts, T0, T_app, uncertainty, count, oblique, best, distance, residual, spread)
+
+def _uncertainty(
+    rows: Observations,
+    system: RobustMean,
+    x: Float,
+    T_K: Float,
+    distance_m: Float32,
+    spread_K: Float32,
+    task: _Task,
+    errors: ErrorModel,
+) -> Uncertainty:
+    calibration = task.calibration
+    fitted = calibration is not None and calibration.shape_sigma > 0
+    return vertex_uncertainty(
+        _levers(rows, system, x, task, errors),
+        x,
+        T_K,
+        epsilon0=system.epsilon0,
+        absolute=task.settings.output == "absolute" and system.angle_corrected,
+        slope_L=task.slope_L,
+        slope_reflected=float(task.band.d_radiance_dT(task.reflected_K)),
+        errors=errors,
+        shape_fitted=fitted,
+        epsilon0_follows=fitted and follows_shape(task.given),
+        reference_sigma_K=calibration.reference_sigma_K if calibration else np.nan,
+        air_K=task.air_K,
+        transmission_per_m=task.settings.transmission_per_m,
+        range_m=distance_m,
+        views_K=None if calibration else spread_K,
+    )
 
 
 # ---------------------------------------------------------------- which observations count
@@ -169,29 +227,19 @@ def _usable(
     return usable, (count > 0) & ~well_seen, count
 
 
-def _chunks(n: int) -> Iterator[slice]:
-    for start in range(0, n, CHUNK):
-        yield slice(start, min(start + CHUNK, n))
-
-
 def _part(rows: Observations, c: slice) -> Observations:
     """Views, not copies, of some rows."""
     return Observations(**{name: getattr(rows, name)[c] for name in rows.__dataclass_fields__})
 
 
-def _sums(vertex: Int, values: NDArray, n_vertices: int) -> Float:
-    """Sum of row values per vertex, (V,) float64."""
-    out = np.zeros(n_vertices)
-    for c in _chunks(len(vertex)):
-        out += np.bincount(vertex[c], weights=values[c], minlength=n_vertices)
-    return out
-
-
 def _mean(rows: Observations, values: NDArray, weights: NDArray, n_vertices: int) -> Float:
     """Weighted mean per vertex, NaN where no row is."""
-    total = _sums(rows.vertex, weights, n_vertices)
+    total = vertex_sums(rows.vertex, weights, n_vertices)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return _sums(rows.vertex, weights * values.astype(np.float64), n_vertices) / np.where(total > 0, total, np.nan)
+        weighted = vertex_sums(rows.vertex, weights * values.astype(np.float64), n_vertices)
+        return weighted / np.where(total > 0, total, np.nan)
+            total > 0, total, np.nan
+        )
 
 
 def _best(rows: Observations, n_vertices: int) -> tuple[Float32, Float32]:
@@ -213,167 +261,71 @@ def _pick(rows: Observations, n_vertices: int, cost: NDArray) -> NDArray[np.intp
     return first[first >= 0]
 
 
-def _paper(best: Observations, raw: Float, emissivity: EmissivityModel, band: Band, reflected_K: float) -> Float:
-    """Method `paper`: Eqs. 24-27 on each vertex's straightest view, in degrees Celsius, as radiance again.
-
-    S is the ratio of measured to corrected temperature where the surface faces the camera: one number a scan.
-    """
-    degC = band.temperature_K(best.radiance.astype(np.float64)) - ZERO_DEGC_K
-    ambient = reflected_K - ZERO_DEGC_K
-    epsilon = emissivity(best.cos_angle.astype(np.float64))
-    corrected, _ = paper_chain(degC, epsilon, ambient)
-    facing = best.cos_angle >= np.cos(np.radians(FACING_DEG))
-    if not facing.any():
-        facing = best.cos_angle >= best.cos_angle.max()
-    S = float(np.median(degC[facing]) / np.median(corrected[facing]))
-    _, scaled = paper_chain(degC, epsilon, ambient, S=S)
-    out = np.full_like(raw, np.nan)
-    out[best.vertex] = band.radiance(scaled + ZERO_DEGC_K)
+def _single(rows: Observations, n_vertices: int, task: _Task) -> Float:
+    """Radiance from one row a vertex: raw, or for method `paper` Eqs. 24-27 in degrees Celsius, as radiance again."""
+    L = rows.radiance.astype(np.float64)
+    if task.settings.method == "paper":
+        degC, ambient = task.band.temperature_K(L) - ZERO_DEGC_K, task.reflected_K - ZERO_DEGC_K
+        epsilon = task.given(rows.cos_angle.astype(np.float64))
+        _, scaled = paper_chain(degC, epsilon, ambient, S=task.paper_S)
+        L = task.band.radiance(scaled + ZERO_DEGC_K)
+    out = np.full(n_vertices, np.nan)
+    out[rows.vertex] = L
     return out
+
+
+def _paper_scale(rows: Observations, emissivity: EmissivityModel, band: Band, reflected_K: float) -> float:
+    """The paper's S (Eq. 26): measured over corrected temperature, °C, where the surface faces the camera."""
+    facing = np.flatnonzero(rows.cos_angle >= min(np.cos(np.radians(FACING_DEG)), rows.cos_angle.max(initial=0)))
+    facing = facing[:: max(1, len(facing) // 100_000)]
+    degC = band.temperature_K(rows.radiance[facing].astype(np.float64)) - ZERO_DEGC_K
+    corrected, _ = paper_chain(degC, emissivity(rows.cos_angle[facing].astype(np.float64)), reflected_K - ZERO_DEGC_K)
+    return float(np.nanmedian(degC) / np.nanmedian(corrected))
 
 
 # ---------------------------------------------------------------- weighted means
 
 
-@dataclass(frozen=True, eq=False)
-class _System:
-    """Rows of y = E·x[vertex] with weights: x is the vertex's normal-equivalent excess over what it reflects."""
-
-    vertex: Int
-    y: Float32
-    E: Float32
-    weight: Float32  # statistical or geometric, before the robust factor
-    robust: Float32  # weight in the end; written by `solve`
-    n_vertices: int
-    angle_corrected: bool
-    statistical: bool  # weight is 1/σ² in radiance
-    slope_L: float
-
-    @classmethod
-    def build(
-        cls,
-        rows: Observations,
-        n_vertices: int,
-        calibration: CrosscalResult | None,
-        model: EmissivityModel,
-        L_r: Float,
-        settings: RadiometrySection,
-        errors: ErrorModel,
-        band: Band,
-    ) -> _System:
-        method = settings.method
-        corrected = method in ("joint", "corrected-cos")
-        statistical = method == "joint" and settings.weight == "inverse-variance"
-        tables = AngleTables.of(model)
-        slope = calibration.slope_L if calibration else skin_slope(band, rows.radiance)
-        n = len(rows)
-        y, E, weight = (np.empty(n, np.float32) for _ in range(3))
-        excess = _mean(rows, rows.radiance, np.ones(n, np.float32), n_vertices) - L_r if statistical else L_r
-        for c in _chunks(n):
-            part = _part(rows, c)
-            L = calibration.corrected(part) if calibration else part.radiance
-            y[c] = L - L_r[part.vertex]
-            E[c] = tables.relative(part.cos_angle) if corrected else 1.0
-            if statistical:
-                weight[c] = 1 / observation_variance(part, excess[part.vertex], tables, errors, slope)
-            elif method == "mean":
-                weight[c] = 1.0
-            else:  # resolution: pixels per surface, proportional to cosθ/d²
-                weight[c] = 1e-6 / part.footprint_m2
-        return cls(rows.vertex, y, E, weight, weight.copy(), n_vertices, corrected, statistical, slope)
-
-    def solve(self, *, robust: bool) -> Float:
-        """x (V,); NaN without rows. Robust: weights of an L1 fit, then Tukey's."""
-        x = self._estimate(self.weight)
-        if not robust or not len(self.vertex):
-            return x
-        root = self._inverse_sigma()
-        for _ in range(L1_STEPS):
-            self._reweight(x, root, L1_FLOOR * self._scale(x, root), _l1)
-            x = self._estimate(self.robust)
-        l1 = self.robust.copy()
-        for _ in range(TUKEY_STEPS):
-            self._reweight(x, root, TUKEY * self._scale(x, root), _tukey)
-            self._keep_measured(l1)
-            x = self._estimate(self.robust)
-        return x
-
-    def _reweight(self, x: Float, root: Float32, reach: float, factor: Callable[[Float32], Float32]) -> None:
-        """Weights times a factor of the standardised residual in units of `reach`."""
-        for c in _chunks(len(self.vertex)):
-            self.robust[c] = self.weight[c] * factor(np.abs(self._residual(x, c)) * root[c] / np.float32(reach))
-
-    def _inverse_sigma(self) -> Float32:
-        """1/σ of rows; for geometric weights relative, the scale makes up for it."""
-        if self.statistical:
-            return np.sqrt(self.weight)
-        return np.sqrt(self.weight / np.float32(np.median(self.weight)))
-
-    def _keep_measured(self, l1: Float32) -> None:
-        """Vertices on which all rows contradict each other keep the weights of the L1 fit."""
-        left = _sums(self.vertex, self.robust, self.n_vertices)
-        lost = left < 0.02 * _sums(self.vertex, self.weight, self.n_vertices)
-        if lost.any():
-            rows = lost[self.vertex]
-            self.robust[rows] = l1[rows]
-
-    def _scale(self, x: Float, root: Float32) -> float:
-        """Robust scale of standardised residuals, from an even sample of rows."""
-        pick = slice(0, None, max(1, len(self.vertex) // 200_000))
-        r = np.abs(self._residual(x, pick)) * root[pick]
-        r = r[np.isfinite(r) & (r > 0)]
-        return max(float(np.median(r)) / 0.6745, 1e-3) if len(r) else 1.0
-
-    def _residual(self, x: Float, c: slice) -> Float32:
-        return np.asarray(self.y[c] - self.E[c] * x[self.vertex[c]].astype(np.float32), np.float32)
-
-    def _estimate(self, weight: Float32) -> Float:
-        wE = weight * self.E
-        a = self.denominator(weight)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            return _sums(self.vertex, wE * self.y, self.n_vertices) / np.where(a > 0, a, np.nan)
-
-    def denominator(self, weight: Float32) -> Float:
-        """Σ w E² per vertex."""
-        return _sums(self.vertex, weight * self.E * self.E, self.n_vertices)
-
-    def scatter(self, x: Float) -> tuple[Float32, Float32]:
-        """Per vertex: rms of residuals in sigmas of the rows' own errors, and in K; NaN with one row only."""
-        ones = np.ones(len(self.vertex), np.float32)
-        n = _sums(self.vertex, ones, self.n_vertices)
-        squares = np.concatenate([self._residual(x, c) ** 2 for c in _chunks(len(self.vertex))] or [ones])
-        with np.errstate(invalid="ignore", divide="ignore"):
-            freedom = np.where(n > 1, n - 1, np.nan)
-            sigmas = np.sqrt(_sums(self.vertex, self.weight * squares, self.n_vertices) / freedom)
-            weighted = _sums(self.vertex, self.robust * squares, self.n_vertices)
-            spread = np.sqrt(weighted / _sums(self.vertex, self.robust, self.n_vertices) * n / freedom)
-        return sigmas.astype(np.float32), (spread / self.slope_L).astype(np.float32)
-
-
-def _l1(t: Float32) -> Float32:
-    return np.asarray(1 / np.maximum(t, np.float32(1)), np.float32)
-
-
-def _tukey(t: Float32) -> Float32:
-    return np.asarray(np.clip(1 - t * t, 0, None) ** 2, np.float32)
-
-
-def _levers(
+def _robust_mean(
     rows: Observations,
-    system: _System,
-    x: Float,
-    calibration: CrosscalResult | None,
-    model: EmissivityModel,
+    L_r: Float,
+    task: _Task,
     errors: ErrorModel,
-) -> Levers:
+) -> RobustMean:
+    """Rows y = E·x with the method's weights."""
+    method, calibration = task.settings.method, task.calibration
+    corrected = method in ("joint", "corrected-cos")
+    statistical = method == "joint" and task.settings.weight == "inverse-variance"
+    tables = AngleTables.of(task.model)
+    n, n_vertices = len(rows), len(L_r)
+    y, E, weight = (np.empty(n, np.float32) for _ in range(3))
+    excess = _mean(rows, rows.radiance, np.ones(n, np.float32), n_vertices) - L_r if statistical else L_r
+    for c in chunks(n):
+        part = _part(rows, c)
+        L = calibration.corrected(part) if calibration else part.radiance
+        y[c] = L - L_r[part.vertex]
+        E[c] = tables.relative(part.cos_angle) if corrected else 1.0
+        if statistical:
+            weight[c] = 1 / observation_variance(part, excess[part.vertex], tables, errors, task.slope_L)
+        elif method == "mean":
+            weight[c] = 1.0
+        else:  # resolution: pixels per surface, proportional to cosθ/d²
+            weight[c] = 1e-6 / part.footprint_m2
+    epsilon0 = task.model.normal if corrected else 1.0
+    return RobustMean(
+        rows.vertex, y, E, weight, weight.copy(), n_vertices, corrected, statistical, epsilon0, task.slope_L
+    )
+
+
+def _levers(rows: Observations, system: RobustMean, x: Float, task: _Task, errors: ErrorModel) -> Levers:
     """Σ over each vertex's rows of h times what an error does to a row, h = wE/ΣwE²."""
-    V, R = system.n_vertices, MODES if calibration else 0
+    V, R = system.n_vertices, MODES if task.calibration else 0
     a = system.denominator(system.robust)
     inverse = np.divide(1.0, a, out=np.zeros(V), where=a > 0)
-    tables = AngleTables.of(model)
+    tables = AngleTables.of(task.model)
     sums, squares = np.zeros((V, 4 + R)), np.zeros((V, 2))
-    effect = calibration.error_modes(MODES) if calibration else None
-    for c in _chunks(len(rows)):
+    effect = task.calibration.error_modes(MODES) if task.calibration else None
+    for c in chunks(len(rows)):
         part = _part(rows, c)
         h = (system.robust[c] * system.E[c] * inverse[part.vertex]).astype(np.float32)
         slope = tables.slope(part.cos_angle) if system.angle_corrected else np.zeros(len(h), np.float32)

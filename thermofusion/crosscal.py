@@ -6,8 +6,8 @@ reflects, an observation of it by view i at pixel (u, v) is
     L = L_r + (E(θ) + s·D(θ))·x_v + b_i + φ(u, v) + γ·(L - L_pivot) + noise,      E = ε(θ)/ε(0),
 
 so that ε(0) plays no part. All x_v are eliminated, which leaves a small system (`overlap`). The common level is no
-matter of overlap: it is imposed as a hard constraint (blackbodies, a contact thermometer, else Σ b = 0 and the result is
-relative). See docs/radiometry.md.
+matter of overlap: it is imposed as a hard constraint (blackbodies, a contact thermometer, else Σ b = 0 and the result
+is relative). See docs/radiometry.md.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class CrosscalResult:
         """Radiance of observations with the camera's offset, field and gain removed, (N,) float32."""
         camera = self.offset_radiance.astype(np.float32)[observations.view]
         if np.any(self.field.coefficients):
-            camera += self.field(observations.u_px, observations.v_px).astype(np.float32)
+            camera += self.field(observations.u_px, observations.v_px)
         if self.gain != 1.0:  # L' = L + γ(L' - pivot) + b + φ
             camera += np.float32(self.gain - 1) * (observations.radiance - np.float32(self.pivot_radiance))
         return observations.radiance - camera

@@ -46,17 +46,35 @@ class ImageField:
         """(N, K) the patterns at pixels."""
         return _monomials(u_px, v_px, self.width_px, self.height_px, self.exponents) @ self.mixing
 
-    def __call__(self, u_px: NDArray, v_px: NDArray) -> Float:
-        """φ at pixels (N,), W m-2 sr-1."""
-        return _monomials(u_px, v_px, self.width_px, self.height_px, self.exponents) @ (self.mixing @ self.coefficients)
+    def __call__(self, u_px: NDArray, v_px: NDArray) -> NDArray:
+        """φ at pixels (N,), W m-2 sr-1, in the pixels' float type."""
+        x, y = _normalised(u_px, v_px, self.width_px, self.height_px)
+        order = int(self.exponents.max(initial=0))
+        table = np.zeros((order + 1, order + 1))
+        table[self.exponents[:, 0], self.exponents[:, 1]] = self.mixing @ self.coefficients
+        out = np.zeros_like(x)
+        for i in range(order, -1, -1):  # Horner in x of Horner in y
+            inner = np.full_like(y, table[i, order - i])
+            for j in range(order - i - 1, -1, -1):
+                inner *= y
+                inner += y.dtype.type(table[i, j])
+            out *= x
+            out += inner
+        return out
+
+
+def _normalised(u_px: NDArray, v_px: NDArray, width_px: int, height_px: int) -> tuple[NDArray, NDArray]:
+    """Image coordinates about the middle, the half width = 1 on both axes."""
+    scale = 2.0 / width_px
+    return (u_px - (width_px - 1) / 2) * scale, (v_px - (height_px - 1) / 2) * scale
 
 
 def _monomials(u_px: NDArray, v_px: NDArray, width_px: int, height_px: int, exponents: Int) -> Float:
-    x = (np.asarray(u_px, np.float64) - (width_px - 1) / 2) / (width_px / 2)
-    y = (np.asarray(v_px, np.float64) - (height_px - 1) / 2) / (width_px / 2)
-    order = int(exponents.max(initial=0))
+    """(N, K+1) products of powers of the normalised coordinates."""
+    u, v = np.asarray(u_px, np.float64), np.asarray(v_px, np.float64)
+    x, y = _normalised(u, v, width_px, height_px)
     powers_x, powers_y = [np.ones_like(x)], [np.ones_like(y)]
-    for _ in range(order):
+    for _ in range(int(exponents.max(initial=0))):
         powers_x.append(powers_x[-1] * x)
         powers_y.append(powers_y[-1] * y)
     return np.stack([powers_x[i] * powers_y[j] for i, j in exponents], axis=1)
