@@ -238,8 +238,6 @@ def _mean(rows: Observations, values: NDArray, weights: NDArray, n_vertices: int
     with np.errstate(invalid="ignore", divide="ignore"):
         weighted = vertex_sums(rows.vertex, weights * values.astype(np.float64), n_vertices)
         return weighted / np.where(total > 0, total, np.nan)
-            total > 0, total, np.nan
-        )
 
 
 def _best(rows: Observations, n_vertices: int) -> tuple[Float32, Float32]:
