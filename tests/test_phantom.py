@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from thermofusion.emissivity import Fresnel
+from thermofusion.emissivity import Fresnel, model_from_recipe
 from thermofusion.errors import RecipeError, ScanError
 from thermofusion.geometry import interpolate_trajectory, rotation_angle_deg, transform_points
 from thermofusion.phantom import Studio, build_phantom, load_scene, scene_from_mapping, shipped_scenes, simulate
@@ -21,7 +21,9 @@ from thermofusion.phantom.render import image_rays
 from thermofusion.phantom.scene import DepthConfig, DriftConfig, ShapeConfig, ThermalConfig
 from thermofusion.phantom.shapes import build_shape
 from thermofusion.phantom.thermal_cameras import counts_to_degC, draw_drift, expose, thermal_camera
+from thermofusion.pipeline import fuse
 from thermofusion.radiometry import Band as SolverBand
+from thermofusion.recipe import load_recipe
 from thermofusion.scans import open_scan
 from thermofusion.scans.native import read_tum_trajectory
 
@@ -405,3 +407,67 @@ def test_an_existing_folder_is_not_overwritten(tmp_path):
     with pytest.raises(ScanError, match="something here already"):
         simulate(scene(), tmp_path / "scan", overwrite=True)  # not a scan: never removed
     assert (tmp_path / "scan" / "notes.txt").read_text() == "mine"
+
+
+# ---------------------------------------------------------------- the method's bars, through the whole pipeline
+
+
+def reduced(name, scale=0.5, **shape):
+    """A shipped scene with fewer and smaller images."""
+    config = load_scene(name)
+    blackbody = replace(config.thermal.blackbody, frames=(0, 6, 11))
+    return replace(
+        config,
+        shape=replace(config.shape, **shape),
+        walk=replace(config.walk, depth_frames=48, depth_hz=6.0),
+        depth=replace(config.depth, scale=scale),
+        thermal=replace(config.thermal, scale=scale, every=3, blackbody=blackbody),
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "recipe", "overrides"),
+    [("cylinder", "phantom-cylinder", ()), ("sphere", "torso", ("radiometry.reflected_degC=20",))],
+)
+def test_isothermal_phantom_is_uniform_after_correction(name, recipe, overrides, tmp_path):
+    """Single observations, corrected for offset, field, ε(θ) and room, must not depend on the viewing angle: less than
+    0.05 K between 0 and 60°, where the apparent temperature falls by several times that."""
+    config = reduced(name)
+    scan = open_scan(simulate(config, tmp_path / "scan", seed=2))
+    settings = load_recipe(recipe, overrides)
+    result = fuse(scan, settings)
+    rows, calibration = result.seen.observations, result.temperature.calibration
+    band = SolverBand(*scan.sensor.band_um)
+    eps = calibration.emissivity(model_from_recipe(settings.emissivity, band))(rows.cos_angle)
+    room = band.radiance(273.15 + config.room.reflected_degC)
+    corrected = band.temperature_K((calibration.corrected(rows) - (1 - eps) * room) / eps)
+    apparent = band.temperature_K(rows.radiance)
+    angle = np.degrees(np.arccos(rows.cos_angle))
+    bins = [(angle >= lo) & (angle < lo + 10) & (rows.edge_px >= 3) for lo in range(0, 60, 10)]
+    assert min(b.sum() for b in bins) > 500
+    assert np.ptp([np.median(apparent[b]) for b in bins]) > 0.2
+    assert np.ptp([np.median(corrected[b]) for b in bins]) < 0.05
+    mesh = result.mesh
+    seen = np.isfinite(mesh.temperature_degC) & (mesh.view_angle_deg < 60)
+    error = mesh.temperature_degC[seen] - np.median(mesh.temperature_degC[seen])
+    assert np.percentile(np.abs(error), 95) < 0.10
+
+
+def test_skin_that_sees_skin_is_not_biased(tmp_path):
+    """Arms at the flanks, legs together: less than 0.1 K of bias where half of the reflected hemisphere is body,
+    although what it reflects there is 13 K warmer than the room."""
+    from scipy.spatial import cKDTree
+
+    config = reduced("folds", scale=1.0, subdivisions=1)
+    root = simulate(config, tmp_path / "scan", seed=2)
+    truth = np.load(root / "truth" / "surface.npz")
+    mesh = fuse(open_scan(root), load_recipe("torso")).mesh
+    gap, nearest = cKDTree(truth["vertices_m"]).query(mesh.surface.vertices_m)
+    error = mesh.temperature_degC - truth["temperature_degC"][nearest]
+    good = np.isfinite(error) & (gap < 0.008) & (mesh.view_angle_deg < 60)
+    error -= np.median(error[good])
+    fraction = truth["body_fraction"][nearest]
+    cavity = good & (fraction > 0.4) & (fraction < 0.6)
+    assert cavity.sum() > 500
+    assert abs(np.median(error[cavity])) < 0.1
+    assert abs(error[cavity].mean()) < 0.1
