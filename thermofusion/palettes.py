@@ -60,8 +60,8 @@ def apply(values: ArrayLike, palette: str, lo: float, hi: float, nan_rgb: tuple[
     """Values of any shape to sRGB uint8 (..., 3); linear from `lo` to `hi`, clipped, NaN becomes `nan_rgb`."""
     v = np.asarray(values, np.float32)
     rgb = table(palette)[palette_index(v, lo, hi)]
-    rgb[np.isnan(v)] = unmeasured_rgb(palette) if nan_rgb is None else nan_rgb
-    return rgb
+    unmeasured = np.array(unmeasured_rgb(palette) if nan_rgb is None else nan_rgb, np.uint8)
+    return np.where(np.isnan(v)[..., None], unmeasured, rgb)
 
 
 def palette_index(values: NDArray, lo: float, hi: float) -> UInt8:

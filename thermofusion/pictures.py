@@ -110,13 +110,13 @@ def write_views(
 def write_png(path: str | Path, image: UInt8) -> Path:
     """Write an RGB (H, W, 3) or grey (H, W) picture, whole or not at all, its folder made. Raises ResourceError."""
     path = Path(path)
+    if image.dtype != np.uint8 or image.shape[2:] not in ((), (3,)) or image.size == 0:
+        raise ValueError(f"a picture of shape {image.shape} and type {image.dtype} cannot be written")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as e:
         raise ResourceError(f"the folder cannot be made ({e.strerror})", place=path.parent) from None
-    ok, data = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)
-    if not ok:
-        raise ValueError(f"a picture of shape {image.shape} and type {image.dtype} cannot be written")
+    _, data = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)
     return write_whole(path, [data.tobytes()])
 
 

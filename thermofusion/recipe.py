@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import tomli_w
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from .errors import RecipeError
 from .resources import recipes_dir
@@ -172,6 +172,13 @@ class OutputSection(_Section):
     range_degC: tuple[float, float] | None = Field(
         None, description="colour range, low and high; None = 1st to 99th percentile"
     )
+
+    @field_validator("range_degC")
+    @classmethod
+    def _rising(cls, value: tuple[float, float] | None) -> tuple[float, float] | None:
+        if value is not None and not value[0] < value[1]:
+            raise ValueError("low must be below high")
+        return value
 
 
 class QualitySection(_Section):

@@ -1,0 +1,238 @@
+"""Palettes, and pictures that a thermographer can measure in."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from result_maker import result, sphere
+
+from thermofusion import lettering, palettes
+from thermofusion.errors import RecipeError
+from thermofusion.export import axes_of
+from thermofusion.pictures import Scale as ColorScale
+from thermofusion.pictures import cast_mesh, paint, render_scalar, render_views, write_png, write_views
+from thermofusion.raycasts import MARGIN, VIEWS, cast_views
+from thermofusion.types import ThermalMesh
+
+INFERNO = ColorScale("inferno", 27.0, 33.0, "°C", "")
+
+
+# ---------------------------------------------------------------- palettes
+
+
+@pytest.mark.parametrize("name", ["inferno", "cividis"])
+def test_published_palettes_are_met(name):
+    """matplotlib ships the authors' tables (Open3D depends on it; the program does not import it)."""
+    matplotlib = pytest.importorskip("matplotlib")
+    published = matplotlib.colormaps[name](np.arange(256))[:, :3] * 255
+    assert np.abs(palettes.table(name) - published).max() < 1.6  # within 1/255 of the rounded table
+
+
+@pytest.mark.parametrize("name", ["inferno", "cividis", "grey", "iron"])
+def test_lightness_rises(name):
+    lightness = palettes.lightness(palettes.table(name))
+    steps = np.diff(lightness[::8])
+    assert (steps > 0).all()
+    assert lightness[-1] - lightness[0] > 70
+    if name != "iron":  # equal steps look equal
+        assert steps.max() < 2.5 * steps.mean()
+
+
+def test_lightness_is_the_standards():
+    # CIE 1976: L* of sRGB mid grey 119 is 50.03; of pure red 53.24; of white 100.
+    np.testing.assert_allclose(
+        palettes.lightness(np.array([[119] * 3, [255, 0, 0], [255] * 3], np.uint8)), [50.03, 53.24, 100], atol=0.02
+    )
+
+
+def test_values_become_colours():
+    table = palettes.table("iron")
+    rgb = palettes.apply([29.0, 30.0, 33.0, 36.0, 40.0, np.nan], "iron", 30, 36, (1, 2, 3))
+    np.testing.assert_array_equal(rgb, [table[0], table[0], table[128], table[255], table[255], (1, 2, 3)])
+    assert not (table == palettes.unmeasured_rgb("iron")).all(axis=1).any()
+    assert not (palettes.table("grey") == palettes.unmeasured_rgb("grey")).all(axis=1).any()
+    for wrong in (("jet", 30, 36), ("iron", 36, 30), ("iron", np.nan, 36)):
+        with pytest.raises(RecipeError):
+            palettes.apply([33.0], *wrong)
+
+
+def test_colour_range():
+    values = np.concatenate([np.linspace(31.23, 35.11, 1000), [5.0, 90.0, np.nan]])
+    assert palettes.color_range(values) == (31.0, 35.5)
+    assert palettes.color_range(values, (30, 36)) == (30.0, 36.0)
+    assert palettes.color_range(values - 33, symmetric=True, step=0.1) == pytest.approx((-2.1, 2.1))
+    assert palettes.color_range(np.full(3, np.nan)) == palettes.DEFAULT_RANGE_DEGC
+    assert palettes.color_range(np.full(3, 33.0)) == (32.5, 33.5)
+
+
+# ---------------------------------------------------------------- views
+
+
+def test_colours_are_the_surfaces_temperatures():
+    """Temperature rises along z: each row of the front view must have its row's colour, to the palette's step."""
+    mesh = result(sphere(120, 160), unmeasured_below_m=-9)
+    cast = cast_mesh(mesh, height_px=556)[0]
+    h, w = cast.shape
+    panel = paint(cast, mesh.temperature_degC, INFERNO)
+    columns = slice(w // 2 - 5, w // 2 + 6)
+    height_m = (h / 2 - 0.5 - np.arange(h)) / cast.px_per_m
+    inside = np.abs(height_m) < 0.097
+    expected = palettes.apply(30 + 30 * height_m, "inferno", 27, 33)
+    assert np.abs(panel[:, columns].astype(int) - expected[:, None])[inside].max() <= 3
+    # The scale is that of the ruler: 0.2 m fill the height but for the margins.
+    assert cast.px_per_m * 0.2 == pytest.approx(h * (1 - 2 * MARGIN), rel=1e-6)
+
+
+def test_views_show_the_right_sides():
+    """One warm spot per direction: up z, front -y; so somebody who faces the first camera has the left hand at +x."""
+    spots = {"front": (0, -1, 0), "back": (0, 1, 0), "left": (1, 0, 0), "right": (-1, 0, 0)}
+    mesh = result(sphere(60, 80), unmeasured_below_m=-9)
+    unit = mesh.surface.normals
+    for cast in cast_mesh(mesh, height_px=300):
+        for name, direction in spots.items():
+            warm = np.where(unit @ direction > 0.97, 33.0, 27.0).astype(np.float32)
+            middle = paint(cast, warm, INFERNO)[cast.shape[0] // 2, cast.shape[1] // 2]
+            assert (middle.sum() > 500) == (name == cast.name)
+    shifted = np.where(unit @ [0.7, -0.7, 0] > 0.97, 33.0, 27.0)
+    front, _, left, right = (paint(c, shifted, INFERNO).astype(int) for c in cast_mesh(mesh, height_px=300))
+    yellow = [
+        np.flatnonzero((p[p.shape[0] // 2, :, 0] > 200) & (p[p.shape[0] // 2, :, 2] < 200))
+        for p in (front, left, right)
+    ]
+    assert (
+        yellow[0].mean() > front.shape[1] * 0.6
+    )  # the left hand's side is at the picture's right, seen from the front,
+    assert yellow[1].mean() < left.shape[1] * 0.4  # and the chest at its left, seen from the left side
+    assert len(yellow[2]) == 0
+
+
+def test_the_world_may_lie_anyhow():
+    """The same body in a world with z up and in one of a first camera (y down) gives the same pictures."""
+    mesh = result(sphere(40, 60, (0.08, 0.05, 0.1)))
+    R = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], float)  # z up, front -y  ->  y down, front -z
+    turned = replace(
+        mesh,
+        surface=replace(mesh.surface, vertices_m=(mesh.surface.vertices_m @ R.T).astype(np.float32)),
+        metadata={},
+    )
+    a, b = render_views(mesh, height_px=240), render_views(turned, height_px=240)
+    c = render_views(replace(mesh, metadata={}), height_px=240, up=[0, 0, 1], front=[0, -1, 0])
+    for name in (*VIEWS, "overview"):
+        assert (np.abs(a[name].astype(int) - b[name]) > 8).mean() < 2e-3, name
+        np.testing.assert_array_equal(a[name], c[name])
+    np.testing.assert_allclose(axes_of(mesh.metadata) @ R.T, axes_of({}), atol=1e-12)
+
+
+def test_unmeasured_inside_and_outline():
+    mesh = result(sphere(60, 80), unmeasured_below_m=0.0)
+    panel = paint(cast_mesh(mesh, height_px=400)[0], mesh.temperature_degC, INFERNO)
+    h, w = panel.shape[:2]
+    below = panel[h * 3 // 4, w // 2 - 40 : w // 2 + 40]
+    assert (below == below[:, :1]).all()  # grey
+    assert len(np.unique(below[:, 0])) == 2  # in stripes
+    assert np.ptp(panel[h // 4, w // 2].astype(int)) > 50  # colour above
+    # A hole in front shows the far wall from inside: dark stripes, never its temperature.
+    front = mesh.surface.vertices_m[mesh.surface.triangles].mean(axis=1)[:, 1] < -0.08
+    holed = replace(mesh, surface=replace(mesh.surface, triangles=mesh.surface.triangles[~front]))
+    cast = cast_mesh(holed, height_px=400)[0]
+    middle = paint(cast, np.full(len(mesh), 33.0), INFERNO)[h // 2 - 10 : h // 2 + 10, w // 2 - 10 : w // 2 + 10]
+    assert set(np.unique(middle)) == {84, 112}
+    # Outlines lie on the contour: every pixel inside keeps its colour.
+    whole = result(sphere(60, 80), unmeasured_below_m=-9)
+    cast = cast_mesh(whole, height_px=400)[0]
+    filled = cast.per_pixel(np.ones(len(cast.pixel))) == 1
+    panel = paint(cast, np.full(len(whole), 30.0), INFERNO)
+    within = cv2.erode(filled.astype(np.uint8), np.ones((3, 3))) > 0
+    assert (np.abs(panel[within].astype(int) - palettes.apply(30.0, "inferno", 27, 33)) <= 1).all()
+    edge = cv2.dilate(filled.astype(np.uint8), np.ones((3, 3))) > 0
+    assert panel[edge & ~filled].mean() < 160  # dark
+    assert (panel[~cv2.dilate(filled.astype(np.uint8), np.ones((7, 7))).astype(bool)] == 255).all()
+
+
+def test_shading_only_if_asked():
+    mesh = result(sphere(60, 80), unmeasured_below_m=-9)
+    casts = cast_mesh(mesh, height_px=300)
+    flat, shaded = (paint(casts[0], mesh.temperature_degC, replace(INFERNO, shading=s)).astype(int) for s in (0, 0.5))
+    h, w = casts[0].shape
+    assert np.abs(flat - shaded)[h // 2, w // 2].max() <= 1
+    assert shaded[h // 2, w // 2 + int(0.42 * h)].sum() < 0.9 * flat[h // 2, w // 2 + int(0.42 * h)].sum()
+
+
+def test_the_bar_says_what_the_colours_mean():
+    """The bar's colour at each tick is the palette's at that tick's value, and it stands in every page."""
+    image = np.full((400, 200, 3), 255, np.uint8)
+    lettering.color_bar(image, (20, 50, 20, 301), "cividis", 30.0, 36.0, "°C", 12, above=True)
+    for value in lettering.ticks(30.0, 36.0):
+        row = round(50 + (36 - value) / 6 * 300)
+        expected = palettes.apply(value, "cividis", 30, 36).astype(int)
+        if value not in (30.0, 36.0):  # there the frame's line
+            assert np.abs(image[row, 30].astype(int) - expected).max() <= 2
+        assert (image[row, 41:45] == lettering.INK).all()
+    assert image[:48, 30].min() < 255  # the point above
+    assert (image[354:, 30] == 255).all()  # none below
+    page = render_views(result(), height_px=300, palette="cividis")["front"]
+    found = {tuple(rgb) for rgb in page[:, -60:].reshape(-1, 3).tolist()}
+    assert len(found & {tuple(rgb) for rgb in palettes.table("cividis").tolist()}) > 100
+
+
+@pytest.mark.parametrize(("lo", "hi"), [(26, 36), (31.5, 33), (-0.3, 0.3), (0, 1e-4), (0, 2500), (36.1, 36.2)])
+def test_ticks_are_round(lo, hi):
+    marks = lettering.ticks(lo, hi)
+    labels = [lettering.tick_label(m, marks) for m in marks]
+    assert lo - 1e-9 <= marks[0] <= marks[-1] <= hi + 1e-9
+    assert 3 <= len(marks) <= 10
+    assert [float(x) for x in labels] == pytest.approx(marks)
+    if lo == 26:
+        assert labels == ["26", "28", "30", "32", "34", "36"]
+
+
+def test_degree_sign_is_drawn():
+    image = np.full((40, 200, 3), 255, np.uint8)
+    lettering.write(image, "°", 20, 30, 16)
+    ink = np.nonzero(image[..., 0] < 128)
+    assert 2 <= np.ptp(ink[0]) <= 9  # small,
+    assert ink[0].max() < 24  # high,
+    assert image[ink[0].min() + np.ptp(ink[0]) // 2, round(ink[1].mean()), 0] > 90  # and hollow
+    before = image.copy()
+    lettering.write(image, "far outside", 900, -50, 16)
+    lettering.write(image, "", 20, 30, 16)
+    np.testing.assert_array_equal(image, before)
+
+
+def test_pictures_are_deterministic_and_written(tmp_path):
+    mesh = result()
+    paths = write_views(mesh, tmp_path / "views", height_px=300)
+    assert {p.stem for p in paths} == {"front", "back", "left", "right", "overview"}
+    pictures = render_views(mesh, height_px=300)
+    for path in paths:
+        np.testing.assert_array_equal(cv2.imread(str(path))[..., ::-1], pictures[path.stem])
+    assert len({p.shape[0] for p in pictures.values()}) == 1
+    with pytest.raises(ValueError, match="cannot be written"):
+        write_png(tmp_path / "x.png", np.zeros((2, 2, 7), np.uint8))
+
+
+@pytest.mark.parametrize("mode", ["nothing", "relative", "difference"])
+def test_odd_results_are_drawn(mode):
+    mesh = result()
+    if mode == "nothing":
+        empty = ThermalMesh.from_temperature(mesh.surface, np.full(len(mesh), np.nan))
+        assert render_views(empty, height_px=200)["front"].shape[0] == 200
+    elif mode == "relative":
+        assert (
+            render_views(mesh, height_px=300)["front"]
+            != render_views(replace(mesh, anchored=True), height_px=300)["front"]
+        ).any()
+    else:
+        values = np.where(mesh.measured, mesh.surface.vertices_m[:, 0], np.nan)
+        page = render_scalar(mesh, values, "Difference", "K", symmetric=True, height_px=300)["front"].astype(int)
+        assert ((page[..., 0] - page[..., 2]) > 60).any()
+        assert ((page[..., 2] - page[..., 0]) > 60).any()
+
+
+def test_no_triangles_is_an_error():
+    surface = replace(sphere(), triangles=np.zeros((0, 3), np.int32))
+    with pytest.raises(ValueError, match="without triangles"):
+        cast_views(surface, np.eye(3), 100)
