@@ -26,6 +26,7 @@ FOCAL_PRIOR = 0.01  # one sigma of a joint focal length about the camera's own f
 CENTER_PRIOR = 0.01  # of the principal point, image widths
 FOCAL_LIMIT = 0.03  # a joint fit that leaves this is not believed
 DEPTH_FOCAL_PRIOR = 0.01  # of a depth camera's focal length about its data sheet
+DEPTH_CENTER_PRIOR = 0.01  # of its principal point, image widths
 DEPTH_PLACE_M = (
     0.1,
     0.1,
@@ -117,7 +118,7 @@ def calibrate_views(
 def _grouping(data: CalibrationSet, single: dict[str, SingleFit]) -> Grouping | None:
     """Runs of views: lenses from the single fits, extrinsic and board poses solved as if for one rig."""
     problem = Problem(data)
-    x0 = _initial(problem, single, {})
+    x0 = initial_guess(problem, single)
     if "thermal" not in problem.cameras or problem.hub == "thermal":
         return None
     held = Options(fixed=frozenset({"spacing", *single}), sigma={c: s.sigma_px for c, s in single.items()})
@@ -125,7 +126,7 @@ def _grouping(data: CalibrationSet, single: dict[str, SingleFit]) -> Grouping | 
     return find_groups(misfits(problem, fit.x))
 
 
-def _initial(problem: Problem, single: dict[str, SingleFit], extra: Mapping[str, Float]) -> Float:
+def initial_guess(problem: Problem, single: dict[str, SingleFit]) -> Float:
     """Start of the joint fit: single lenses; poses in the hub's frame, through the extrinsic where the hub is blind."""
     x = np.zeros(len(problem.names))
     poses = {c: s.poses() for c, s in single.items()}
@@ -152,9 +153,6 @@ def _initial(problem: Problem, single: dict[str, SingleFit], extra: Mapping[str,
         seen = next(c for c in (hub, *problem.cameras) if view.name in poses.get(c, {}))
         T = poses[seen][view.name]
         x[problem.slices[f"view:{view.name}"]] = to_rt(T if seen == hub else invert(T_c_hub[seen]) @ T)
-    for key, value in extra.items():
-        if key in problem.slices:
-            x[problem.slices[key]] = value
     return x
 
 
@@ -165,7 +163,7 @@ def _joint(data: CalibrationSet, single: dict[str, SingleFit], groups: dict[str,
     options = Options(
         fixed=fixed, priors=_priors(single, problem, None), sigma={c: s.sigma_px for c, s in single.items()}
     )
-    fit = solve(problem, _initial(problem, single, {}), options)
+    fit = solve(problem, initial_guess(problem, single), options)
     for _ in range(2):
         options = replace(options, sigma=_sigmas(fit, single))
         fit = solve(problem, fit.x, options)
@@ -249,7 +247,7 @@ def _priors(
     if depth_camera is not None and "depth" not in single:
         k, w = intrinsics_of(depth_camera), depth_camera.width_px
         for n, m, e in zip(
-            ("fx", "fy", "cx", "cy"), k, (DEPTH_FOCAL_PRIOR * k[0],) * 2 + (0.01 * w,) * 2, strict=False
+            ("fx", "fy", "cx", "cy"), k, (DEPTH_FOCAL_PRIOR * k[0],) * 2 + (DEPTH_CENTER_PRIOR * w,) * 2, strict=False
         ):
             out[f"depth.{n}"] = (float(m), float(e))
     return out

@@ -1,0 +1,156 @@
+"""A rig with known truth, seen by noisy cameras: what every claim of the calibration is measured against."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry import pixel_rays, pose, project, se3_exp
+from ..types import Camera, Float
+from .board import Board
+from .cameras import rotations
+from .views import BoardPoints, CalibrationSet, View
+
+
+def _camera(w: int, h: int, f: float, center: tuple[float, float], distortion: tuple[float, ...]) -> Camera:
+    K = np.array([[f, 0, (w - 1) / 2 + center[0]], [0, f, (h - 1) / 2 + center[1]], [0, 0, 1.0]])
+    return Camera(w, h, K, np.array(distortion))
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedRig:
+    """Truth: three cameras and how they sit (`T_color_depth`, `T_thermal_depth`), and the board."""
+
+    board: Board = field(default_factory=lambda: Board("pins", 9, 9, 0.05))
+    color: Camera = field(default_factory=lambda: _camera(1280, 960, 1052.0, (8, -11), (0.05, -0.1, 0.001, -0.001, 0)))
+    thermal: Camera = field(default_factory=lambda: _camera(640, 480, 800.0, (-6, 9), (-0.25, 0.2, 0.0, 0.001, 0)))
+    depth: Camera = field(default_factory=lambda: _camera(640, 480, 585.0, (2, -1), (0, 0, 0, 0, 0)))
+    T_color_depth: Float = field(default_factory=lambda: se3_exp(np.array([0.004, -0.006, 0.002, -0.025, 0.001, -0.003])))
+    T_thermal_depth: Float = field(default_factory=lambda: se3_exp(np.array([0.05, 0.02, -0.01, 0.01, -0.09, -0.02])))
+
+    def camera(self, name: str) -> Camera:
+        return {"color": self.color, "thermal": self.thermal, "depth": self.depth}[name]
+
+    def T_camera_depth(self, name: str) -> Float:
+        return {"color": self.T_color_depth, "thermal": self.T_thermal_depth, "depth": np.eye(4)}[name]
+
+
+@dataclass(frozen=True)
+class Noise:
+    """px: one sigma of a picked point by camera. missing: share of pins not found. depth: m at 1 m, growing as range².
+    wild: share of picks that are wrong by up to 20 px."""
+
+    color_px: float = 0.25
+    thermal_px: float = 0.35
+    missing: float = 0.1
+    wild: float = 0.0
+    depth_m: float = 1.5e-3
+
+
+def board_poses(rig: SimulatedRig, count: int, rng: np.random.Generator) -> list[Float]:
+    """T_depth_board of stands at 0.9-1.8 m, tilted up to 40 deg to all sides, whole board in every picture."""
+    w, h = rig.board.extent_m
+    center = pose(np.eye(3), np.array([-w / 2, -h / 2, 0]))
+    poses: list[Float] = []
+    while len(poses) < count:
+        axis = rng.normal(size=2)
+        tilt = np.radians(rng.uniform(5, 42)) * axis / np.linalg.norm(axis)
+        R = rotations(np.array([[tilt[0], tilt[1], np.radians(rng.uniform(-15, 15))]]))[0]
+        z = rng.uniform(0.9, 1.8)
+        T = pose(R, np.array([rng.uniform(-0.3, 0.3) * z, rng.uniform(-0.25, 0.25) * z, z])) @ center
+        if all(_inside(rig, name, T) for name in ("color", "thermal", "depth")):
+            poses.append(T)
+    return poses
+
+
+def _inside(rig: SimulatedRig, name: str, T_depth_board: Float, margin_px: float = 6.0) -> bool:
+    camera, X = rig.camera(name), rig.board.outline_m(0.5)
+    T = rig.T_camera_depth(name) @ T_depth_board
+    uv = project(camera, X @ T[:3, :3].T + T[:3, 3])[0]
+    limit = np.array([camera.width_px, camera.height_px]) - 1 - margin_px
+    return bool(np.isfinite(uv).all() and (uv > margin_px).all() and (uv < limit).all())
+
+
+def true_pixels(rig: SimulatedRig, name: str, T_depth_board: Float) -> Float:
+    """(N, 2) exact pixels of all board points in one camera."""
+    T, X = rig.T_camera_depth(name) @ T_depth_board, rig.board.points_m
+    return project(rig.camera(name), X @ T[:3, :3].T + T[:3, 3])[0]
+
+
+def simulate_set(
+    rig: SimulatedRig, seed: int, *, views: int = 24, noise: Noise | None = None, with_depth: bool = True
+) -> tuple[CalibrationSet, dict[str, Callable[[], NDArray]], list[Float]]:
+    """What detectors would hand over: the views, depth image loaders by view name, and the true T_depth_board."""
+    noise, rng = noise or Noise(), np.random.default_rng(seed)
+    poses = board_poses(rig, views, rng)
+    out, depth = [], {}
+    for i, T in enumerate(poses):
+        name, points = f"{i:04d}", {}
+        for camera, sigma in (("color", noise.color_px), ("thermal", noise.thermal_px)):
+            px = true_pixels(rig, camera, T) + rng.normal(0, sigma, (len(rig.board), 2))
+            wild = rng.random(len(px)) < noise.wild
+            px[wild] += rng.uniform(-20, 20, (wild.sum(), 2))
+            kept = rng.random(len(px)) >= (noise.missing if camera == "thermal" else 0)
+            points[camera] = BoardPoints(np.flatnonzero(kept), px[kept])
+        out.append(View(name, points))
+        if with_depth:
+            depth[name] = _depth_loader(rig, T, noise.depth_m, int(rng.integers(2**31)))
+    sizes = {n: (rig.camera(n).width_px, rig.camera(n).height_px) for n in ("color", "thermal")}
+    return CalibrationSet(rig.board, sizes, tuple(out)), depth, poses
+
+
+def _depth_loader(rig: SimulatedRig, T: Float, noise_m: float, seed: int) -> Callable[[], NDArray]:
+    return lambda: plane_depth(rig, T, noise_m, seed)
+
+
+def plane_depth(rig: SimulatedRig, T_depth_board: Float, noise_m: float, seed: int) -> NDArray[np.float32]:
+    """(H, W) metres: the board (0.7 spacings beyond its points) before a wall at 3 m, with range² noise; NaN never."""
+    rays = pixel_rays(rig.depth)
+    rays = rays / rays[..., 2:]
+    n, p = T_depth_board[:3, 2], T_depth_board[:3, 3]
+    z = (n @ p) / (rays @ n)
+    X = (rays * z[..., None] - p) @ T_depth_board[:3, :3]
+    w, h = rig.board.extent_m
+    m = 0.7 * rig.board.spacing_m
+    on = (X[..., 0] > -m) & (X[..., 0] < w + m) & (X[..., 1] > -m) & (X[..., 1] < h + m) & (z > 0)
+    z = np.where(on, z, 3.0)
+    return (z + np.random.default_rng(seed).normal(0, noise_m, z.shape) * z**2).astype(np.float32)
+
+
+def thermal_picture(
+    rig: SimulatedRig, T_depth_board: Float, seed: int, *, blur_px: float = 1.0, noise: float = 5.0, missing: float = 0.1
+) -> NDArray[np.uint16]:
+    """(H, W) counts: pins of either sign on a board with a slow gradient, optical blur, pixel noise, some pins gone.
+
+    A pin reflects what stands before it: bright where that is warm, dark where it is cold, both in one picture.
+    """
+    rng, camera = np.random.default_rng(seed), rig.thermal
+    fine = 4
+    px = true_pixels(rig, "thermal", T_depth_board)
+    image = np.zeros((camera.height_px * fine, camera.width_px * fine), np.float32)
+    across = np.sin(np.linspace(0, np.pi, rig.board.columns) + rng.uniform(0, 3))
+    contrast = rng.uniform(25, 90, len(px)) * np.sign(np.tile(across, rig.board.rows) + rng.normal(0, 0.3, len(px)))
+    contrast[rng.random(len(px)) < missing] = 0
+    step = np.linalg.norm(px[1] - px[0])
+    for (u, v), c in zip(px, contrast, strict=True):
+        center = (round(((u + 0.5) * fine - 0.5) * 16), round(((v + 0.5) * fine - 0.5) * 16))
+        cv2.circle(image, center, round(0.05 * step * fine * 16), float(c), -1, cv2.LINE_AA, 4)
+    image = cv2.GaussianBlur(image, (0, 0), blur_px * fine)
+    image = cv2.resize(image, (camera.width_px, camera.height_px), interpolation=cv2.INTER_AREA) * 2.0
+    y, x = np.mgrid[0 : camera.height_px, 0 : camera.width_px]
+    slow = 60 * ((x / camera.width_px - 0.5) ** 2 + (y / camera.height_px - 0.4) ** 2)
+    return np.round(24_200 + slow + image + rng.normal(0, noise, image.shape)).astype(np.uint16)
+
+
+def mirrored(data: CalibrationSet, camera: str) -> CalibrationSet:
+    """The same set with one camera's pictures flipped left to right."""
+    width = data.image_size[camera][0]
+    views = []
+    for v in data.views:
+        p = v.points[camera]
+        views.append(v.with_points(camera, BoardPoints(p.index, p.px * [-1, 1] + [width - 1, 0])))
+    return replace(data, views=tuple(views))
