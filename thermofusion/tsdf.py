@@ -29,7 +29,7 @@ VOXEL_BOUNDS_M = (2e-3, 10e-3)
 TRUNCATION_PER_NOISE = 6.0  # wide enough that noise is averaged, not cut; wider rounds off edges
 FAR_NOISE_PER_TRUNCATION = 0.5  # depth noisier than this share of the truncation would only blur
 FAR_PER_MEDIAN = 1.3  # but nothing nearer than this share of the median range is given up
-MIN_TRUNCATION_VOXELS = 3.0
+MIN_TRUNCATION_VOXELS, MIN_TRUNCATION_M = 3.0, 8e-3  # poses are rarely better than 2 mm
 MAX_VOXEL_M = 0.1
 ESTIMATE_MARGIN = 1.1
 TOUCH_STRIDE_PX, TOUCHES_PER_BLOCK = 4, 3
@@ -160,7 +160,7 @@ def _with_truncation(voxel: float, survey: Survey, recipe: Recipe, max_blocks: i
     """Truncation and far limit that go with a voxel and the noise at the subject's distance."""
     z, noise = survey.median_range_m, survey.noise_m_at_1m
     if recipe.fusion.truncation_voxels == "auto":
-        truncation = max(MIN_TRUNCATION_VOXELS * voxel, TRUNCATION_PER_NOISE * noise * z**2)
+        truncation = max(MIN_TRUNCATION_VOXELS * voxel, MIN_TRUNCATION_M, TRUNCATION_PER_NOISE * noise * z**2)
     else:
         truncation = recipe.fusion.truncation_voxels * voxel
     far = max(float(np.sqrt(FAR_NOISE_PER_TRUNCATION * truncation / noise)), FAR_PER_MEDIAN * z)
