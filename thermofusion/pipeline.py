@@ -104,7 +104,7 @@ def fuse(
     surface = run("surface", lambda p: fuse_surface(scan, trajectory, recipe, floor_plane=tracking.floor_plane))
     alignment = seen = temperature = None
     if surface is not None and scan.thermal is None:
-        temperature = unmeasured(scan, surface.mesh, recipe, trajectory)
+        temperature = unmeasured(scan, surface.mesh, recipe, _axes(scan, tracking, surface))
     elif surface is not None:
         # 2. Rig
         alignment = run("align", lambda p: align_thermal(scan, surface.mesh, trajectory, recipe))
@@ -113,7 +113,9 @@ def fuse(
         # 4. Temperature
         temperature = run(
             "temperature",
-            lambda p: measure(scan, surface.mesh, seen, recipe, trajectory=trajectory, compare=compare_methods),
+            lambda p: measure(
+                scan, surface.mesh, seen, recipe, axes=_axes(scan, tracking, surface), compare=compare_methods
+            ),
         )
 
     report = result_report(scan, recipe, tracking, surface, alignment, seen, temperature, stages.reused)
@@ -167,6 +169,15 @@ def load_mesh(folder: Path, show: str = "absolute") -> ThermalMesh:
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as e:
         raise ScanError(f"no finished result is here ({e})", place=path, hint="run `thermofusion run` first") from None
     return temperature.shown(show)
+
+
+def _axes(scan: Scan, tracking: TrackingResult, surface: FusionResult) -> dict[str, str]:
+    from .export import view_axes
+
+    floor = surface.floor_plane if surface.floor_plane is not None else tracking.floor_plane
+    centre_m = surface.mesh.vertices_m.mean(0)
+    normal = None if floor is None else floor[:3]
+    return view_axes(tracking.trajectory.T_world_depth, centre_m, normal, scan.depth_up)
 
 
 def _stages(scan: Scan, folder: Path | None, redo_from: str | None) -> Stages:

@@ -7,7 +7,7 @@ and `blending`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +19,6 @@ from .blending import BlendResult, blend, remove_air_path
 from .crosscal import CrosscalResult, cross_calibrate
 from .emissivity import EmissivityModel, model_from_recipe
 from .errors import RecipeError, ScanError
-from .export import view_axes
 from .projection import SurfaceRays, observe
 from .radiometry import ZERO_DEGC_K, Band, SignalConverter
 from .recipe import RadiometrySection, Recipe
@@ -153,7 +152,7 @@ def measure(
     seen: Seen,
     recipe: Recipe,
     *,
-    trajectory: Trajectory | None = None,
+    axes: Mapping[str, str] | None = None,
     compare: bool = False,
 ) -> Temperature:
     """The temperature of every vertex that was seen.
@@ -161,6 +160,8 @@ def measure(
     1. Surroundings: what each vertex reflects, first with the body at one temperature.
     2. Cross-calibration of the views (method `joint`). 3. Blending. 4. Reflection again with the temperatures found,
     and a last blending with the errors' dependence on the temperature's own gradient.
+
+    axes : which way is up and where the front is, for the mesh's metadata (`export.view_axes`).
     """
     assert scan.sensor is not None
     assert scan.rig.thermal is not None
@@ -208,7 +209,7 @@ def measure(
         methods = {m: _difference(r, result) for m, r in others.items()}
     body_fraction = None if around is None else around.body_fraction
     return Temperature(
-        mesh=_mesh(scan, surface, result, calibration, body_fraction, recipe, trajectory),
+        mesh=_mesh(scan, surface, result, calibration, body_fraction, recipe, axes),
         absolute_degC=_degC(result.absolute_K),
         normal_equivalent_degC=_degC(result.normal_equivalent_K),
         apparent_degC=_degC(result.apparent_K),
@@ -220,10 +221,10 @@ def measure(
     )
 
 
-def unmeasured(scan: Scan, surface: SurfaceMesh, recipe: Recipe, trajectory: Trajectory | None = None) -> Temperature:
+def unmeasured(scan: Scan, surface: SurfaceMesh, recipe: Recipe, axes: Mapping[str, str] | None = None) -> Temperature:
     """The result of a scan without thermal frames: a surface, and no temperatures."""
     nan = np.full(len(surface), np.nan, np.float32)
-    metadata = _metadata(surface, recipe, trajectory)
+    metadata = _metadata(recipe, axes)
     mesh = ThermalMesh.from_temperature(surface, nan, mode=recipe.radiometry.output, anchored=False, metadata=metadata)
     note = "the scan has no thermal stream: the mesh carries no temperatures"
     return Temperature(mesh, nan, nan, nan, messages=(note,))
@@ -351,7 +352,7 @@ def _mesh(
     calibration: CrosscalResult | None,
     body_fraction: Float32 | None,
     recipe: Recipe,
-    trajectory: Trajectory | None,
+    axes: Mapping[str, str] | None,
 ) -> ThermalMesh:
     flags = np.zeros(len(surface), np.uint8)
     flags[result.count == 1] |= np.uint8(VertexFlag.SINGLE_VIEW)
@@ -371,13 +372,12 @@ def _mesh(
         observations=result.count,
         flags=flags,
         uncertainty_parts=result.uncertainty.parts_K,
-        metadata=_metadata(surface, recipe, trajectory) | {"scan": scan.name},
+        metadata=_metadata(recipe, axes) | {"scan": scan.name},
     )
 
 
-def _metadata(surface: SurfaceMesh, recipe: Recipe, trajectory: Trajectory | None) -> dict[str, str | float]:
-    axes = {} if trajectory is None else view_axes(trajectory.T_world_depth, surface.vertices_m.mean(0))
-    return {"version": __version__, "recipe": recipe.name, "frame": "world, metres, right-handed", **axes}
+def _metadata(recipe: Recipe, axes: Mapping[str, str] | None) -> dict[str, str | float]:
+    return {"version": __version__, "recipe": recipe.name, "frame": "world, metres, right-handed", **(axes or {})}
 
 
 def _crosscal_report(c: CrosscalResult, seen: Seen) -> dict[str, Any]:

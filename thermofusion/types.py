@@ -240,6 +240,7 @@ class Scan:
     references: tuple[Reference, ...] = ()
     trajectory: Trajectory | None = None
     depth_unit_m: float = 0.001
+    depth_up: tuple[float, float, float] = (0.0, -1.0, 0.0)  # which way is up for the depth camera as it was held
     recorded_at: str | None = None
     subject: dict[str, object] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  # what the reader had to assume, or kept without understanding

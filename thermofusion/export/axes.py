@@ -18,14 +18,22 @@ CAMERA_FRONT = (0.0, 0.0, -1.0)  # toward that camera: it looks along +z
 MIN_TURN = 0.02  # second eigenvalue of the cameras' right axes: sin²(8°), below which they span no plane
 
 
-def view_axes(T_world_depth: Float, centre_m: ArrayLike, floor_normal: ArrayLike | None = None) -> dict[str, str]:
+def view_axes(
+    T_world_depth: Float,
+    centre_m: ArrayLike,
+    floor_normal: ArrayLike | None = None,
+    depth_up: ArrayLike = CAMERA_UP,
+) -> dict[str, str]:
     """The metadata entries `up` and `front` from the trajectory (N, 4, 4) and the subject's centre (3,).
 
+    depth_up : which way was up for the camera as it was held: (0, -1, 0), or (-1, 0, 0) turned by a quarter.
     up : the floor's normal where one was found. Else hand-held cameras are pitched at will but hardly rolled, so their
     right axes are level: up is what is perpendicular to all of them (smallest eigenvector of Σ r rᵀ), if they turn
     enough to span a plane, or else the mean of their own up axes. front : level, toward the first camera.
     """
-    right, own_up = T_world_depth[:, :3, 0], -T_world_depth[:, :3, 1].mean(axis=0)
+    held = np.asarray(depth_up, np.float64)
+    R = T_world_depth[:, :3, :3]
+    right, own_up = R @ np.cross(CAMERA_FRONT, held), (R @ held).mean(axis=0)
     if floor_normal is not None:
         up = np.asarray(floor_normal, np.float64)
     else:

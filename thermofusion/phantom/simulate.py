@@ -38,7 +38,7 @@ from .thermal_cameras import (
     thermal_camera,
     vignetting_field,
 )
-from .walk import Motion, color_rig, thermal_rig
+from .walk import Motion, color_rig, held_up, thermal_rig
 from .writing import camera_json, whole_folder, write_frames, write_image, write_json, write_trajectory
 
 BREATH_LEVELS = 12  # the breathing surface is cast in so many steps: 0.4 mm apart for 5 mm
@@ -267,7 +267,11 @@ def scan_document(phantom: Phantom) -> dict[str, Any]:
     """scan.json: what a recorder would know, errors of rig and room included."""
     scene, thermal = phantom.scene, phantom.thermal
     cameras: dict[str, Any] = {
-        "depth": {**camera_json(phantom.depth.camera, phantom.depth.name), "depth_unit_m": 0.001},
+        "depth": {
+            **camera_json(phantom.depth.camera, phantom.depth.name),
+            "depth_unit_m": 0.001,
+            "up": held_up(scene.walk.roll_deg),
+        },
         "thermal": {
             **camera_json(thermal.camera, thermal.name),
             "band_um": list(thermal.band_um),

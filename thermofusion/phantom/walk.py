@@ -122,6 +122,12 @@ def path(walk: WalkConfig, phase: Float) -> Float:
     return T
 
 
+def held_up(roll_deg: float) -> list[float]:
+    """Which way is up in the frame of a depth camera that is rolled by an angle: (0, -1, 0) upright."""
+    a = np.radians(roll_deg)
+    return [round(float(-np.sin(a)), 6) + 0.0, round(float(-np.cos(a)), 6) + 0.0, 0.0]
+
+
 def thermal_rig(rig: RigConfig, rng: np.random.Generator) -> tuple[Float, Float]:
     """(true, written) T_thermal_depth: they differ by the scene's calibration error in a random direction."""
     true = se3_exp(THERMAL_TWIST)

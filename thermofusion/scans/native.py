@@ -54,6 +54,7 @@ def read_native(root: Path) -> Scan:
         references=tuple(reference_of(r) for r in doc.references),
         trajectory=read_tum_trajectory(trajectory_file) if trajectory_file.exists() else None,
         depth_unit_m=unit_m,
+        depth_up=doc.cameras.depth.up,
         recorded_at=doc.recorded_at,
         subject=doc.subject,
         notes=(*doc.notes, *notes),

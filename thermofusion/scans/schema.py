@@ -59,6 +59,7 @@ class DepthCameraDoc(CameraDoc):
     """The depth camera."""
 
     depth_unit_m: float = Field(0.001, gt=1e-6, le=0.1)
+    up: tuple[float, float, float] = (0.0, -1.0, 0.0)
 
 
 class ThermalCameraDoc(CameraDoc):

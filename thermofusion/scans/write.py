@@ -71,7 +71,9 @@ def _swap(new: Path, out: Path) -> None:
 def scan_json(scan: Scan) -> dict[str, Any]:
     """The content of scan.json for a scan."""
     rig = scan.rig
-    cameras: dict[str, Any] = {"depth": {**_camera(rig.depth), "depth_unit_m": scan.depth_unit_m}}
+    cameras: dict[str, Any] = {
+        "depth": {**_camera(rig.depth), "depth_unit_m": scan.depth_unit_m, "up": list(scan.depth_up)}
+    }
     extrinsics: dict[str, Any] = {}
     if rig.color is not None and rig.T_color_depth is not None:
         cameras["color"] = _camera(rig.color)
