@@ -3,91 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from walkround import ROOM_DEGC, T_THERMAL_DEPTH, ellipsoid, make_scan, walk
 
 from thermofusion._open3d import o3d
 from thermofusion.alignment import PRIOR_TIME_S, AlignmentResult, align_thermal
 from thermofusion.errors import ScanError
-from thermofusion.geometry import interpolate_trajectory, invert, pixel_rays, pose, se3_exp, se3_log
+from thermofusion.geometry import invert, pose, se3_exp, se3_log
 from thermofusion.recipe import load_recipe
 from thermofusion.scans import open_scan
-from thermofusion.types import Camera, Rig, Scan, SignalCurve, Stream, SurfaceMesh, ThermalSensor, Trajectory
-
-ROOM_DEGC, SKIN_DEGC, NETD_K = 22.0, 33.0, 0.06
-THERMAL = Camera(
-    320, 240, np.array([[300.0, 0, 161], [0, 305, 121], [0, 0, 1]]), np.array([-0.2, 0.08, 1e-3, -5e-4, 0])
-)
-DEPTH = Camera(640, 480, np.array([[590.0, 0, 319.5], [0, 590, 239.5], [0, 0, 1]]))
-FINE_RAYS = pixel_rays(
-    THERMAL, *np.meshgrid(np.arange(-0.25, 319.5, 0.5), np.arange(-0.25, 239.5, 0.5))
-)  # 2 x 2 a pixel
-T_THERMAL_DEPTH = se3_exp(np.array([0.05, 0.02, -0.01, 0.02, -0.1, 0.01]))
-
-
-def ellipsoid(n: int = 140) -> SurfaceMesh:
-    """A body-sized ellipsoid with bumps of a centimetre; normals of the mesh."""
-    polar, azimuth = np.meshgrid(np.linspace(0.01, np.pi - 0.01, n), np.linspace(0, 2 * np.pi, 2 * n), indexing="ij")
-    d = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], -1)
-    radius = 1 + 0.06 * np.sin(5 * azimuth) * np.sin(polar) ** 2 + 0.05 * np.sin(7 * polar)
-    p = (d * radius[..., None] * [0.22, 0.15, 0.38]).reshape(-1, 3).astype(np.float32)
-    i = np.arange(n * 2 * n).reshape(n, 2 * n)
-    a, b, c, e = (x.ravel() for x in (i[:-1, :-1], i[1:, :-1], i[1:, 1:], i[:-1, 1:]))
-    triangles = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, e], 1)]).astype(np.int32)
-    mesh = o3d.t.geometry.TriangleMesh(o3d.core.Tensor(p), o3d.core.Tensor(triangles))
-    mesh.compute_vertex_normals()
-    return SurfaceMesh(p, triangles, mesh.vertex.normals.numpy())
-
-
-def walk(duration_s: float = 8.0, tremor: float = 1.0) -> Trajectory:
-    """Once round at 1.1 m, looking at the middle, with the unsteadiness of a hand (1 cm, 1°)."""
-    t = np.arange(0, duration_s, 1 / 15)
-    phase = 2 * np.pi * t / duration_s
-    eye = 1.1 * np.stack([np.cos(phase), np.sin(phase), 0.1 * np.sin(2 * phase)], -1)
-    z = -eye / np.linalg.norm(eye, axis=1, keepdims=True)
-    x = np.cross(z, [0, 0, 1.0])
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    R = np.stack([x, np.cross(z, x), z], 2)
-    rate = np.array([1.1, 1.7, 0.9, 1.3, 0.7, 1.9]) * 2 * np.pi
-    shake = tremor * np.sin(rate * t[:, None] + np.arange(6)) * ([0.01] * 3 + [0.008] * 3)
-    return Trajectory(t, np.stack([pose(r, e) for r, e in zip(R, eye, strict=True)]) @ se3_exp(shake))
-
-
-def render(mesh: SurfaceMesh, T_world_thermal: np.ndarray, skin_degC: float, seed: int) -> np.ndarray:
-    """What the camera reports, °C: 2 x 2 rays a pixel, emissivity falling at the limb, point spread, noise, offset."""
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(o3d.core.Tensor(mesh.vertices_m), o3d.core.Tensor(mesh.triangles.astype(np.uint32)))
-    rays = FINE_RAYS @ T_world_thermal[:3, :3].T
-    eye = np.broadcast_to(T_world_thermal[:3, 3], rays.shape)
-    answer = scene.cast_rays(o3d.core.Tensor(np.concatenate([eye, rays], -1).astype(np.float32)))
-    t = answer["t_hit"].numpy()
-    hit = np.isfinite(t)
-    p = eye + np.where(hit, t, 0)[..., None] * rays
-    cos = np.abs((answer["primitive_normals"].numpy() * rays).sum(-1))
-    pattern = skin_degC + (skin_degC != ROOM_DEGC) * np.sin(12 * p[..., 0] + 3) * np.cos(15 * p[..., 2])
-    emissivity = 0.98 * (1 - (1 - cos) ** 5)
-    image = np.where(hit, ROOM_DEGC + emissivity * (pattern - ROOM_DEGC), ROOM_DEGC)
-    image = image.reshape(240, 2, 320, 2).mean((1, 3))
-    noise = np.random.default_rng(seed).normal(0, NETD_K, image.shape)
-    return (cv2.GaussianBlur(image, (0, 0), 0.8) + noise + 0.5 * np.sin(seed)).astype(np.float32)
-
-
-def make_scan(mesh: SurfaceMesh, trajectory: Trajectory, *, skin_degC: float = SKIN_DEGC, clock_s: float = 0.0) -> Scan:
-    """24 thermal frames; each is stamped `clock_s` later than it was taken."""
-    taken = np.linspace(0.3, trajectory.times_s[-1] - 0.3, 24)
-    T_world_depth, _ = interpolate_trajectory(trajectory, taken)
-    images = [render(mesh, T @ invert(T_THERMAL_DEPTH), skin_degC, i) for i, T in enumerate(T_world_depth)]
-    places, index = tuple(f"thermal {i}" for i in range(24)), np.arange(24)
-    thermal = Stream(taken + clock_s, lambda i: images[i], places, index, np.ones(24, bool))
-    depth = Stream(np.zeros(0), lambda i: np.zeros(0), (), np.zeros(0, np.int64), np.zeros(0, bool))
-    sensor = ThermalSensor(SignalCurve("apparent_degC"), netd_K=NETD_K)
-    return Scan(
-        "ellipsoid", Path(), "made", Rig(DEPTH, THERMAL, T_THERMAL_DEPTH), depth, thermal=thermal, sensor=sensor
-    )
+from thermofusion.types import Scan, SurfaceMesh, Trajectory
 
 
 def turned(scan: Scan, rotation_deg: list[float], translation_m: tuple[float, ...] = (0, 0, 0)) -> Scan:
@@ -221,7 +149,7 @@ def test_same_input_same_result_and_switches(body, scan):
 
 @pytest.mark.parametrize(("rotation_deg", "clock_s"), [([0.3, -0.3, 0.26], 0.04), ([0.0, 0.5, 0.0], -0.04)])
 def test_torso_recording(shared_data, rotation_deg, clock_s):
-    """The simulated walk round a person with its true surface: half a degree and 40 ms are found."""
+    """The simulated walk round a person, with its true surface: half a degree and 40 ms are found."""
     root = shared_data("torso-dev")
     truth = np.load(root / "truth" / "surface.npz")
     mesh = o3d.t.geometry.TriangleMesh(o3d.core.Tensor(truth["vertices_m"]), o3d.core.Tensor(truth["triangles"]))

@@ -14,35 +14,28 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .errors import ScanError
 from .geometry import interpolate_trajectory, invert, se3_exp, se3_log
-from .radiometry import SignalConverter
+from .outlines import MIN_POINTS, Contrast, OutlineView, measure_outline, reach_px, read_outlines, tukey
 from .recipe import Recipe
-from .silhouettes import Contour, OutlineCaster, find_edges, project_contour, smooth_image
-from .types import Camera, Float, Float32, Scan, SurfaceMesh, Trajectory
+from .types import Camera, Float, Scan, Stream, SurfaceMesh, Trajectory
 
 MAX_VIEWS = 30
-MAX_POINTS = 400  # contour points used in a view
 REACH_DEG = (1.6, 1.0, 0.7) + (0.5,) * 9  # how far from the prediction an edge is looked for, by iteration
 AT_REST = 0.1  # of a sigma: a smaller step ends the iterations
-MIN_REACH_PX = 3.0
 PRIOR_ROTATION_DEG = 0.7  # of a calibrated rig that was handled since
 PRIOR_TRANSLATION_M = 0.004
 PRIOR_TIME_S = 0.05
 PRIOR_WIDTH_PX = 2.0
 SYSTEMATIC_PX = 0.1  # errors of the model's outline that all views share (voxels, window): no average removes them
 VELOCITY_STEP_S = 0.02
-MIN_STEP_NETD = 8.0  # an outline whose step is smaller than this many NETD shows nothing
-MIN_STEP_SHARE = 0.4  # of the usual step: weaker ones are other things (hair, clothes, a warm background)
-TUKEY = 4.685
 HELD_SHARE = 0.7  # a sigma this near to its prior's is the prior's
-MIN_SCALE_PX = 0.15
 MIN_VIEWS = 6
-MIN_POINTS = 200
 SUPPORT_CHI2 = 24.3  # 99.9 % of chi-square with 7 degrees of freedom: below it the data do not ask for a change
 PARAMETERS = 8
 
@@ -88,16 +81,23 @@ def align_thermal(
 
     Raises ScanError if the scan has no thermal stream, or an image cannot be read.
     """
-    start = _calibrated(scan)
+    stream, camera, rig, sensor = scan.thermal, scan.rig.thermal, scan.rig.T_thermal_depth, scan.sensor
+    if stream is None or camera is None or rig is None or sensor is None:
+        raise ScanError("the scan has no thermal stream", place=scan.root, hint="there is nothing to align")
+    start = _State(rig, sensor.time_offset_s)
     if not recipe.crosscal.align:
         return _unchanged(start, "alignment is switched off by the recipe")
-    views = _prepare(scan, mesh, trajectory, start, recipe.input.max_pose_gap_ms / 1e3, progress)
-    if views is None:
+    frames = _frames(stream, trajectory, start, recipe.input.max_pose_gap_ms / 1e3)
+    T_world_depth, _ = interpolate_trajectory(trajectory, stream.times_s[frames] + start.time_offset_s)
+    report = None if progress is None else partial(progress, "align")
+    T_world_thermal = T_world_depth @ invert(start.T_thermal_depth)
+    outlines, contrast = read_outlines(scan, mesh, frames.tolist(), T_world_thermal, report)
+    if len(outlines) < MIN_VIEWS:
         return _unchanged(start, f"fewer than {MIN_VIEWS} thermal views show an outline that could be used")
-    contrast = views.contrast()
     if contrast is None:
         return _unchanged(start, "the outline does not stand out from the background in the thermal images")
-    return _refine(views, start, contrast)
+    times_s = stream.times_s[frames[[v.row for v in outlines]]]
+    return _refine(_Views(camera, trajectory, outlines, times_s, contrast), start)
 
 
 # ---------------------------------------------------------------- the measurements
@@ -121,14 +121,6 @@ class _State:
 
 
 @dataclass(frozen=True, eq=False)
-class _View:
-    time_s: float  # the thermal frame's own
-    smooth: Float32
-    contour: Contour
-    range_m: float  # median
-
-
-@dataclass(frozen=True, eq=False)
 class _Measured:
     """Residuals [px] of all views' contour points, their derivatives by the eight parameters, and their views."""
 
@@ -138,109 +130,41 @@ class _Measured:
 
 
 @dataclass(frozen=True, eq=False)
-class _Contrast:
-    """sign : body minus background. step : usual height of the outline's step, in-band radiance."""
-
-    sign: float
-    step: float
-
-
-@dataclass(frozen=True, eq=False)
 class _Views:
     camera: Camera
     trajectory: Trajectory
-    views: tuple[_View, ...]
-    start: _State
-    noise: float  # NETD in in-band radiance
+    views: tuple[OutlineView, ...]
+    times_s: Float  # of the views, the thermal stream's own
+    contrast: Contrast
 
-    def contrast(self) -> _Contrast | None:
-        """How the outline shows in the images; None if it does not."""
-        reach = _reach_px(self.camera, REACH_DEG[0])
-        T_thermal_world, _ = self._poses(self.start)
-        outlines = [
-            project_contour(self.camera, T, v.contour) for T, v in zip(T_thermal_world, self.views, strict=True)
-        ]
-        step = [find_edges(v.smooth, o, reach, 0.0).step for o, v in zip(outlines, self.views, strict=True)]
-        found = np.concatenate(step)
-        found = found[np.isfinite(found)]
-        if len(found) < MIN_POINTS or abs(np.median(found)) < MIN_STEP_NETD * self.noise:
-            return None
-        return _Contrast(float(np.sign(np.median(found))), float(abs(np.median(found))))
-
-    def measure(self, state: _State, reach_px: float, contrast: _Contrast) -> _Measured:
+    def measure(self, state: _State, reach: float) -> _Measured:
         T_thermal_world, velocity = self._poses(state)
         residual, jacobian = [], []
-        for i, view in enumerate(self.views):
-            outline = project_contour(self.camera, T_thermal_world[i], view.contour)
-            edges = find_edges(view.smooth, outline, reach_px, contrast.sign)
-            step = contrast.sign * edges.step / contrast.step
-            with np.errstate(invalid="ignore"):
-                good = np.isfinite(edges.offset_px) & (step > MIN_STEP_SHARE) & (step < 1 / MIN_STEP_SHARE)
-            along = outline.px_per_m[good]
-            motion = np.concatenate([np.cross(outline.point_m[good], along), along], axis=1)  # along · (ω x p + v)
-            residual.append(edges.offset_px[good] - state.width_px)
-            jacobian.append(np.column_stack([motion, motion @ velocity[i], np.ones(len(motion))]))
+        for view, T, twist in zip(self.views, T_thermal_world, velocity, strict=True):
+            m = measure_outline(self.camera, view, T, reach, self.contrast)
+            residual.append(m.residual_px - state.width_px)
+            jacobian.append(np.column_stack([m.motion, m.motion @ twist, np.ones(len(m.motion))]))
         index = np.repeat(np.arange(len(residual)), [len(r) for r in residual])
         return _Measured(np.concatenate(residual), np.concatenate(jacobian), index)
 
     def _poses(self, state: _State) -> tuple[Float, Float]:
         """T_thermal_world (N, 4, 4) of the views, and the world's twist in the thermal frame per second, (N, 6)."""
-        times = np.array([v.time_s for v in self.views]) + state.time_offset_s
-        h = VELOCITY_STEP_S
+        times, h = self.times_s + state.time_offset_s, VELOCITY_STEP_S
         T_world_depth, _ = interpolate_trajectory(self.trajectory, np.concatenate([times, times - h, times + h]))
         now, before, after = np.split(state.T_thermal_depth @ invert(T_world_depth), 3)
         return now, se3_log(after @ invert(before)) / (2 * h)
 
 
-def _reach_px(camera: Camera, reach_deg: float) -> float:
-    return max(MIN_REACH_PX, float(np.radians(reach_deg)) * camera.focal_px)
-
-
-def _calibrated(scan: Scan) -> _State:
-    if scan.thermal is None or scan.rig.thermal is None or scan.rig.T_thermal_depth is None or scan.sensor is None:
-        raise ScanError("the scan has no thermal stream", place=scan.root, hint="there is nothing to align")
-    return _State(scan.rig.T_thermal_depth, scan.sensor.time_offset_s)
-
-
-def _prepare(
-    scan: Scan,
-    mesh: SurfaceMesh,
-    trajectory: Trajectory,
-    start: _State,
-    max_gap_s: float,
-    progress: Progress | None,
-) -> _Views | None:
-    """Smoothed images and outlines of evenly chosen views whose poses are known a little before and after, too."""
-    stream, camera, sensor = scan.thermal, scan.rig.thermal, scan.sensor
-    if stream is None or camera is None or sensor is None:
-        return None
-    times = stream.times_s + start.time_offset_s
+def _frames(stream: Stream, trajectory: Trajectory, start: _State, max_gap_s: float) -> NDArray[np.intp]:
+    """Thermal frames chosen evenly among those whose poses are known a little before and after, too."""
     placed = stream.usable.copy()
     for shift in (-2 * PRIOR_TIME_S, 0.0, 2 * PRIOR_TIME_S):
-        placed &= interpolate_trajectory(trajectory, times + shift, max_gap_s=max_gap_s)[1]
+        times = stream.times_s + start.time_offset_s + shift
+        placed &= interpolate_trajectory(trajectory, times, max_gap_s=max_gap_s)[1]
     frames = np.flatnonzero(placed)
     if len(frames) > MAX_VIEWS:
         frames = frames[np.round(np.linspace(0, len(frames) - 1, MAX_VIEWS)).astype(int)]
-    T_world_depth, _ = interpolate_trajectory(trajectory, times[frames])
-    converter, caster = SignalConverter(sensor), OutlineCaster(mesh, camera)
-    views: list[_View] = []
-    level: list[float] = []
-    for i, frame in enumerate(frames):
-        contour = caster.contour(T_world_depth[i] @ invert(start.T_thermal_depth))
-        if len(contour) >= MIN_POINTS // MIN_VIEWS:
-            every = -(-len(contour) // MAX_POINTS)
-            radiance = converter.radiance(stream.load(int(frame)), stream.places[frame])
-            level.append(float(np.nanmedian(radiance)))
-            thinned = Contour(contour.point_m[::every], contour.normal[::every])
-            range_m = float(np.median(np.linalg.norm(thinned.point_m - T_world_depth[i, :3, 3], axis=1)))
-            views.append(_View(float(stream.times_s[frame]), smooth_image(radiance), thinned, range_m))
-        if progress:
-            progress("align", i + 1, len(frames))
-    if len(views) < MIN_VIEWS:
-        return None
-    band = converter.band
-    noise = sensor.netd_K * float(band.d_radiance_dT(band.temperature_K(np.median(level))))
-    return _Views(camera, trajectory, tuple(views), start, noise)
+    return frames
 
 
 # ---------------------------------------------------------------- the estimate
@@ -255,12 +179,12 @@ class _Solved:
     rest: float  # largest step of the last iteration, in sigmas
 
 
-def _refine(views: _Views, start: _State, contrast: _Contrast) -> AlignmentResult:
-    before = _summary_px(views, start, contrast)
-    solved = _solve(views, start, contrast)
+def _refine(views: _Views, start: _State) -> AlignmentResult:
+    before = _summary_px(views, start)
+    solved = _solve(views, start)
     if solved is None:
         return _unchanged(start, "too few points of the outline were found in the thermal images", before)
-    after = _summary_px(views, solved.state, contrast)
+    after = _summary_px(views, solved.state)
     change = solved.state.distance(start)[:7]
     cov = solved.covariance[:7, :7] + _shared_error(views)
     chi2 = float(change @ np.linalg.solve(cov, change))
@@ -297,15 +221,15 @@ def _refine(views: _Views, start: _State, contrast: _Contrast) -> AlignmentResul
     )
 
 
-def _solve(views: _Views, start: _State, contrast: _Contrast) -> _Solved | None:
+def _solve(views: _Views, start: _State) -> _Solved | None:
     """Robust Gauss-Newton with the calibrated rig as prior, the reach of the search shrinking."""
     prior = np.diag(1 / np.append(np.diag(_prior_covariance()), PRIOR_WIDTH_PX**2))
     state, solved = start, None
     for reach_deg in REACH_DEG:
-        m = views.measure(state, _reach_px(views.camera, reach_deg), contrast)
+        m = views.measure(state, reach_px(views.camera, reach_deg))
         if len(m.residual_px) < MIN_POINTS:
             return None
-        weight, scale = _tukey(m.residual_px)
+        weight, scale = tukey(m.residual_px)
         information = m.jacobian.T @ (weight[:, None] * m.jacobian) / scale**2
         gradient = m.jacobian.T @ (weight * m.residual_px) / scale**2
         deflate = _design_effect(m, weight / scale**2, information)
@@ -318,13 +242,6 @@ def _solve(views: _Views, start: _State, contrast: _Contrast) -> _Solved | None:
         if reach_deg == REACH_DEG[-1] and rest < AT_REST:
             break
     return solved
-
-
-def _tukey(residual: Float) -> tuple[Float, float]:
-    """Tukey's biweights about the median (a common offset is the estimate's business), and the robust scale."""
-    scale = max(1.4826 * float(np.median(np.abs(residual - np.median(residual)))), MIN_SCALE_PX)
-    u = (residual - np.median(residual)) / (TUKEY * scale)
-    return np.where(np.abs(u) < 1, (1 - u * u) ** 2, 0.0), scale
 
 
 def _design_effect(m: _Measured, weight: Float, information: Float) -> float:
@@ -345,9 +262,9 @@ def _design_effect(m: _Measured, weight: Float, information: Float) -> float:
     return max(1.0, float(np.trace(np.linalg.lstsq(information, spread, rcond=None)[0])) / PARAMETERS)
 
 
-def _summary_px(views: _Views, state: _State, contrast: _Contrast) -> float:
+def _summary_px(views: _Views, state: _State) -> float:
     """Robust RMS residual over a fixed, wide reach, so that before and after compare; median (width) removed."""
-    r = views.measure(state, _reach_px(views.camera, REACH_DEG[0]), contrast).residual_px
+    r = views.measure(state, reach_px(views.camera, REACH_DEG[0])).residual_px
     return float(1.4826 * np.median(np.abs(r - np.median(r)))) if len(r) else float("nan")
 
 
