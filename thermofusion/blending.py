@@ -169,7 +169,8 @@ def _blend(rows: Observations, L_r: Float, task: _Task, errors: ErrorModel) -> B
         uncertainty = Uncertainty.of({"noise": np.where(np.isnan(L_s), np.nan, errors.netd_K)})
     else:
         system = _robust_mean(rows, L_r, task, errors)
-        x = system.solve(robust=method == "joint")
+        scale = task.calibration.residual_sigma if task.calibration and system.statistical else None
+        x = system.solve(robust=method == "joint", scale=scale)
         L0, L_s = L_r + x, L_r + x / system.epsilon0
         residual, spread = system.scatter(x)
         uncertainty = _uncertainty(rows, system, x, band.temperature_K(L_s), distance, spread, task, errors)
@@ -275,10 +276,12 @@ def _single(rows: Observations, n_vertices: int, task: _Task) -> Float:
 def _paper_scale(rows: Observations, emissivity: EmissivityModel, band: Band, reflected_K: float) -> float:
     """The paper's S (Eq. 26): measured over corrected temperature, °C, where the surface faces the camera."""
     facing = np.flatnonzero(rows.cos_angle >= min(np.cos(np.radians(FACING_DEG)), rows.cos_angle.max(initial=0)))
-    facing = facing[:: max(1, len(facing) // 100_000)]
+    facing = facing[np.isfinite(rows.radiance[facing])][:: max(1, len(facing) // 100_000)]
+    if not len(facing):
+        return 1.0
     degC = band.temperature_K(rows.radiance[facing].astype(np.float64)) - ZERO_DEGC_K
     corrected, _ = paper_chain(degC, emissivity(rows.cos_angle[facing].astype(np.float64)), reflected_K - ZERO_DEGC_K)
-    return float(np.nanmedian(degC) / np.nanmedian(corrected))
+    return float(np.median(degC) / np.median(corrected))
 
 
 # ---------------------------------------------------------------- weighted means
@@ -296,17 +299,16 @@ def _robust_mean(
     statistical = method == "joint" and task.settings.weight == "inverse-variance"
     tables = AngleTables.of(task.model)
     n, n_vertices = len(rows), len(L_r)
-    y, E, weight = (np.empty(n, np.float32) for _ in range(3))
-    excess = _mean(rows, rows.radiance, np.ones(n, np.float32), n_vertices) - L_r if statistical else L_r
+    y, E, weight = np.empty(n), np.empty(n), np.ones(n, np.float32)
     for c in chunks(n):
         part = _part(rows, c)
-        L = calibration.corrected(part) if calibration else part.radiance
-        y[c] = L - L_r[part.vertex]
+        y[c] = (calibration.corrected(part) if calibration else part.radiance) - L_r[part.vertex]
         E[c] = tables.relative(part.cos_angle) if corrected else 1.0
+    excess = _mean(rows, y, weight, n_vertices) if statistical else L_r
+    for c in chunks(n if method != "mean" else 0):
+        part = _part(rows, c)
         if statistical:
             weight[c] = 1 / observation_variance(part, excess[part.vertex], tables, errors, task.slope_L)
-        elif method == "mean":
-            weight[c] = 1.0
         else:  # resolution: pixels per surface, proportional to cosθ/d²
             weight[c] = 1e-6 / part.footprint_m2
     epsilon0 = task.model.normal if corrected else 1.0
@@ -327,7 +329,12 @@ def _levers(rows: Observations, system: RobustMean, x: Float, task: _Task, error
         part = _part(rows, c)
         h = (system.robust[c] * system.E[c] * inverse[part.vertex]).astype(np.float32)
         slope = tables.slope(part.cos_angle) if system.angle_corrected else np.zeros(len(h), np.float32)
-        columns = [np.ones(len(h), np.float32), 1 - system.E[c], slope, registration_m(part, errors)]
+        columns = [
+            np.ones(len(h), np.float32),
+            (1 - system.E[c]).astype(np.float32),
+            slope,
+            registration_m(part, errors),
+        ]
         block = np.stack(columns, axis=1)
         if effect is not None:
             block = np.concatenate([block, effect(part, x[part.vertex])], axis=1)

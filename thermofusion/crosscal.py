@@ -3,7 +3,7 @@
 What one view saw obliquely another saw straight on. With x_v the normal-equivalent radiance of vertex v above what it
 reflects, an observation of it by view i at pixel (u, v) is
 
-    L = L_r + (E(θ) + s·D(θ))·x_v + b_i + φ(u, v) + γ·(L - L_pivot) + noise,      E = ε(θ)/ε(0),
+    L' = L + γ·(L - L_pivot) + b_i + φ(u, v) + noise,      L = L_r + (E(θ) + s·D(θ))·x_v,      E = ε(θ)/ε(0),
 
 so that ε(0) plays no part. All x_v are eliminated, which leaves a small system (`overlap`). The common level is no
 matter of overlap: it is imposed as a hard constraint (blackbodies, a contact thermometer, else Σ b = 0 and the result
@@ -80,14 +80,13 @@ class CrosscalResult:
         """The model with the fitted shape (and its ε(0), see `emissivity.reshaped`)."""
         return reshaped(model, self.shape)
 
-    def corrected(self, observations: Observations) -> Float32:
-        """Radiance of observations with the camera's offset, field and gain removed, (N,) float32."""
-        camera = self.offset_radiance.astype(np.float32)[observations.view]
+    def corrected(self, observations: Observations) -> Float:
+        """Radiance of observations with the camera's offset, field and gain removed, (N,) float64."""
+        L = observations.radiance.astype(np.float64)
+        camera = self.offset_radiance[observations.view]
         if np.any(self.field.coefficients):
-            camera += self.field(observations.u_px, observations.v_px)
-        if self.gain != 1.0:  # L' = L + γ(L' - pivot) + b + φ
-            camera += np.float32(self.gain - 1) * (observations.radiance - np.float32(self.pivot_radiance))
-        return observations.radiance - camera
+            camera = camera + self.field(observations.u_px, observations.v_px)
+        return np.asarray((L - camera + (self.gain - 1) * self.pivot_radiance) / self.gain)
 
     def error_modes(self, count: int) -> Callable[[Observations, NDArray], Float32]:
         """How the strongest error modes of this calibration shift observations: (rows, x of rows) -> (N, count)."""
@@ -189,8 +188,11 @@ def _system(
     count = np.bincount(vertex)
     L, cos = rows.radiance.astype(np.float64), rows.cos_angle.astype(np.float64)
     y = L - L_r[rows.vertex]
-    slope_L = skin_slope(band, rows.radiance)
-    excess = (np.bincount(vertex, y) / count)[vertex]
+    # weights must not depend on the camera's common offset: what references say of it is taken off first
+    contact_rows = _contact_rows(contacts, numbers, L_r, emissivity.normal)
+    common = _common_offset(np.bincount(vertex, y) / count, blackbodies, contact_rows)
+    slope_L = skin_slope(band, L - common)
+    excess = (np.bincount(vertex, y - common) / count)[vertex]
     field = ImageField.zero(*image_size)
     K = len(field.coefficients) if settings.vignetting else 0
     expected = np.array([r.expected for r in blackbodies])
@@ -198,7 +200,7 @@ def _system(
     pivot = float(expected.mean()) if len(expected) else 0.0
     columns = np.zeros((len(rows), K + 2))
     columns[:, :K] = field.patterns(rows.u_px, rows.v_px)[:, :K]
-    columns[:, -1] = L - pivot if use_gain else 0.0
+    columns[:, -1] = L_r[rows.vertex] - pivot if use_gain else 0.0  # what (1+γ)x leaves of γ
     return OverlapSystem(
         vertex=vertex.astype(np.int32),
         group=rows.view if settings.offsets else np.zeros(len(rows), np.int32),
@@ -218,7 +220,7 @@ def _system(
         pivot=pivot,
         readings=tuple(blackbodies),
         reading_groups=tuple(r.view if settings.offsets else 0 for r in blackbodies),
-        contacts=tuple(_contact_rows(contacts, numbers, L_r, emissivity.normal)),
+        contacts=tuple(contact_rows),
     )
 
 
@@ -234,6 +236,15 @@ def _contact_rows(
             local = np.searchsorted(numbers, known).astype(np.int32)
             out.append(ContactRow(local, expected, epsilon0 * contact.sigma_expected))
     return out
+
+
+def _common_offset(y_mean: Float, blackbodies: Sequence[BlackbodyReading], contacts: Sequence[ContactRow]) -> float:
+    """A first guess of the offset common to all views; 0 without a reference."""
+    if blackbodies:
+        return float(np.mean([r.measured - r.expected for r in blackbodies]))
+    if contacts:
+        return float(np.mean([y_mean[c.vertices].mean() - c.expected for c in contacts]))
+    return 0.0
 
 
 # ---------------------------------------------------------------- what the data carry

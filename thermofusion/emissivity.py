@@ -9,13 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 from scipy.interpolate import PchipInterpolator
 
 from .errors import RecipeError
 from .radiometry import Band, planck_radiance
 from .recipe import EmissivitySection
-from .types import Float, Float32
+from .types import Float
 
 COSINE_EPSILON0 = 0.98  # the paper's reference model is 0.98·cosθ
 # n, k of the models that take them: the paper's skin, and an effective index of water at 307 K (9e-4 up to 85°)
@@ -263,25 +263,25 @@ def model_from_recipe(section: EmissivitySection, band: Band) -> EmissivityModel
 
 @dataclass(frozen=True, eq=False)
 class AngleTable:
-    """A smooth function of cosθ as a float32 table, linear between 4097 knots."""
+    """A smooth function of cosθ as a table, linear between 4097 knots: within 5e-7 for ε of any model."""
 
-    values: Float32
-    steps: Float32
+    values: NDArray
+    steps: NDArray
 
     @classmethod
-    def of(cls, function: EmissivityModel | NDArray) -> AngleTable:
-        """From a callable of cosθ, or its values at `AngleTable.knots()`."""
+    def of(cls, function: EmissivityModel | NDArray, dtype: DTypeLike = np.float32) -> AngleTable:
+        """From a callable of cosθ, or its values at `AngleTable.knots()`; `dtype` is the float type of the answers."""
         values = function(cls.knots()) if callable(function) else function
         v = np.append(np.asarray(values, np.float64), values[-1])
-        return cls(v[:-1].astype(np.float32), np.diff(v).astype(np.float32))
+        return cls(v[:-1].astype(dtype), np.diff(v).astype(dtype))
 
     @staticmethod
     def knots() -> Float:
-        """Cosines 0..1 at which the table is exact; the first stands for grazing incidence."""
+        """Cosines 0..1 at which the table is exact."""
         return np.linspace(0, 1, LOOKUP_KNOTS)
 
-    def __call__(self, cos_theta: NDArray) -> Float32:
-        """Values at cosines in [0, 1], float32; outside the nearest end."""
+    def __call__(self, cos_theta: NDArray) -> NDArray:
+        """Values at cosines in [0, 1]; outside the nearest end."""
         x = np.clip(cos_theta, 0, 1).astype(np.float32) * np.float32(LOOKUP_KNOTS - 1)
         i = x.astype(np.int32)
-        return np.asarray(self.values.take(i) + self.steps.take(i) * (x - i.astype(np.float32)), np.float32)
+        return np.asarray(self.values.take(i) + self.steps.take(i) * (x - i.astype(np.float32)))

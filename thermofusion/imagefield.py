@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from .types import Float, Int
 
 FIELD_ORDER = 4  # polynomial order
+GRID = 64  # points along each side over which patterns are orthonormal
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +31,8 @@ class ImageField:
     def zero(cls, width_px: int, height_px: int, order: int = FIELD_ORDER) -> ImageField:
         """The field of an ideal camera."""
         exponents = np.array([(i, n - i) for n in range(order + 1) for i in range(n + 1)], np.int32)
-        v, u = np.mgrid[0 : height_px - 1 : 40j, 0 : width_px - 1 : 40j]
-        grid = _monomials(u.ravel(), v.ravel(), width_px, height_px, exponents)
+        v, u = (np.mgrid[0:GRID, 0:GRID].reshape(2, -1) + 0.5) / GRID * [[height_px], [width_px]] - 0.5
+        grid = _monomials(u, v, width_px, height_px, exponents)
         r = np.linalg.qr(grid, mode="r")
         scale = np.sqrt(len(grid)) * np.sign(np.diag(r))
         mixing = np.linalg.solve(r, np.eye(len(r)))[:, 1:] * scale[1:]

@@ -63,9 +63,9 @@ class ContactRow:
 
 @dataclass(frozen=True, eq=False)
 class OverlapSystem:
-    """Rows y = (E + s·D)·x[vertex] + b[group] + φ + γ·excess_L, with variances; vertices numbered without gaps.
+    """Rows y = (E + s·D)·x[vertex] + b[group] + φ + γ·(L_r - pivot), with variances; vertices numbered without gaps.
 
-    columns : (N, K + 2) C-contiguous: field patterns, D·x of the last step, L - pivot. group : (N,) the offset's index.
+    x holds the camera's gain 1 + γ. columns : (N, K + 2): field patterns, D·x of the last step, L_r - pivot. group : (N,) the offset's index.
     keep : (K_all, K) combinations of the field's patterns that are solved for. order, start : rows by vertex.
     """
 

@@ -13,6 +13,7 @@ from .types import Float, Float32, Int
 
 CHUNK = 1_000_000  # rows worked on at once
 L1_STEPS, TUKEY_STEPS = 4, 3
+SCALE_ROWS = 200_000  # enough for a robust scale
 L1_FLOOR = 0.3  # of one sigma: below it the L1 start is quadratic
 
 
@@ -21,8 +22,8 @@ class RobustMean:
     """Rows of y = E·x[vertex] with weights: x is the vertex's normal-equivalent excess over what it reflects."""
 
     vertex: Int
-    y: Float32
-    E: Float32
+    y: Float
+    E: Float
     weight: Float32  # statistical or geometric, before the robust factor
     robust: Float32  # weight in the end; written by `solve`
     n_vertices: int
@@ -31,18 +32,22 @@ class RobustMean:
     epsilon0: float  # 1 where nothing is corrected
     slope_L: float
 
-    def solve(self, *, robust: bool) -> Float:
-        """x (V,); NaN without rows. Robust: weights of an L1 fit, then Tukey's."""
+    def solve(self, *, robust: bool, scale: float | None = None) -> Float:
+        """x (V,); NaN without rows. Robust: weights of an L1 fit, then Tukey's.
+
+        scale : of residuals over the rows' own σ; None = taken from the residuals.
+        """
         x = self._estimate(self.weight)
         if not robust or not len(self.vertex):
             return x
         root = self._inverse_sigma()
+        sample = self._scale_rows() if scale is None else None
         for _ in range(L1_STEPS):
-            self._reweight(x, root, L1_FLOOR * self._scale(x, root), _l1)
+            self._reweight(x, root, L1_FLOOR * (scale or self._scale(x, root, sample)), _l1)
             x = self._estimate(self.robust)
         l1 = self.robust.copy()
         for _ in range(TUKEY_STEPS):
-            self._reweight(x, root, TUKEY * self._scale(x, root), _tukey)
+            self._reweight(x, root, TUKEY * (scale or self._scale(x, root, sample)), _tukey)
             self._keep_measured(l1)
             x = self._estimate(self.robust)
         return x
@@ -66,15 +71,26 @@ class RobustMean:
             rows = lost[self.vertex]
             self.robust[rows] = l1[rows]
 
-    def _scale(self, x: Float, root: Float32) -> float:
-        """Robust scale of standardised residuals, from an even sample of rows."""
-        pick = slice(0, None, max(1, len(self.vertex) // 200_000))
-        r = np.abs(self._residual(x, pick)) * root[pick]
-        r = r[np.isfinite(r) & (r > 0)]
-        return max(float(np.median(r)) / 0.6745, 1e-3) if len(r) else 1.0
+    def _scale_rows(self) -> tuple[NDArray, Float]:
+        """Rows that the robust scale is taken from, and what makes up for their vertex's own freedom.
 
-    def _residual(self, x: Float, c: slice) -> Float32:
-        return np.asarray(self.y[c] - self.E[c] * x[self.vertex[c]].astype(np.float32), np.float32)
+        An even sample of the vertices with two rows or more, by number: whatever the views' order.
+        """
+        stride = max(1, len(self.vertex) // SCALE_ROWS)
+        pick = np.flatnonzero(self.vertex % stride == 0)
+        count = np.bincount(self.vertex[pick], minlength=self.n_vertices)[self.vertex[pick]]
+        pick, count = pick[count > 1], count[count > 1]
+        return pick, np.sqrt(count / (count - 1))
+
+    def _scale(self, x: Float, root: Float32, sample: tuple[NDArray, Float] | None) -> float:
+        """Robust scale of standardised residuals."""
+        if sample is None or not len(sample[0]):
+            return 1.0
+        pick, freedom = sample
+        return max(float(np.median(np.abs(self._residual(x, pick)) * root[pick] * freedom)) / 0.6745, 1e-3)
+
+    def _residual(self, x: Float, rows: slice | NDArray) -> Float32:
+        return np.asarray(self.y[rows] - self.E[rows] * x[self.vertex[rows]], np.float32)
 
     def _estimate(self, weight: Float32) -> Float:
         wE = weight * self.E

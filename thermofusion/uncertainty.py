@@ -39,7 +39,7 @@ class ErrorModel:
 
 @dataclass(frozen=True, eq=False)
 class AngleTables:
-    """E(θ) = ε(θ)/ε(0) and |dE/dθ| [rad-1] as fast tables over cosθ."""
+    """E(θ) = ε(θ)/ε(0), float64, and |dE/dθ| [rad-1], float32, as fast tables over cosθ."""
 
     relative: AngleTable
     slope: AngleTable
@@ -49,7 +49,7 @@ class AngleTables:
         mu = AngleTable.knots()
         theta = np.arccos(np.clip(mu, 1e-4, 1 - 1e-9))
         slope = np.minimum(np.abs(model.derivative(theta)) / model.normal, MAX_LEVER)
-        return cls(AngleTable.of(model.relative(mu)), AngleTable.of(slope))
+        return cls(AngleTable.of(model.relative(mu), np.float64), AngleTable.of(slope))
 
 
 def observation_variance(
@@ -67,7 +67,7 @@ def observation_variance(
     cos = observations.cos_angle
     x = np.asarray(excess, np.float32)
     variance = np.full(len(cos), (errors.netd_K * slope_L) ** 2, np.float32)
-    loss = 1 - tables.relative(cos)
+    loss = (1 - tables.relative(cos)).astype(np.float32)
     variance += (x * tables.slope(cos) * np.float32(np.radians(errors.sigma_normal_deg))) ** 2
     variance += (loss * (np.abs(x) * np.float32(errors.sigma_shape))) ** 2
     variance += (loss * np.float32(errors.sigma_reflected_K * slope_L)) ** 2
