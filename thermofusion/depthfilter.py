@@ -5,9 +5,11 @@ Pure NumPy and OpenCV, no Open3D, no files. Tracking and fusion both look at dep
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -167,11 +169,19 @@ class DepthFrames:
         return filter_depth(self._undistort(self._stream.load(i)), self.camera, self._section)
 
     def read_ahead(self, frames: Sequence[int], *, workers: int = 2) -> Iterator[tuple[int, Float32]]:
-        """(i, frame i) in the order given, a few frames decoded ahead on threads (bounded, whatever the consumer)."""
-        with ThreadPoolExecutor(workers) as pool:
-            todo = iter(frames)
-            pending = [(i, pool.submit(self.load, i)) for i in islice(todo, 2 * workers)]
-            while pending:
-                i, result = pending.pop(0)
-                pending.extend((j, pool.submit(self.load, j)) for j in islice(todo, 1))
-                yield i, result.result()
+        """(i, frame i) in the order given, a few frames decoded ahead on threads."""
+        return zip(frames, read_ahead(self.load, frames, workers=workers), strict=True)
+
+
+T = TypeVar("T")
+
+
+def read_ahead(load: Callable[[int], T], indices: Iterable[int], *, workers: int = 2) -> Iterator[T]:
+    """load(i) for each index, in order, a few ahead on threads; never more in memory than that."""
+    with ThreadPoolExecutor(workers) as pool:
+        todo = iter(indices)
+        pending = deque(pool.submit(load, i) for i in islice(todo, 2 * workers))
+        while pending:
+            result = pending.popleft()
+            pending.extend(pool.submit(load, i) for i in islice(todo, 1))
+            yield result.result()

@@ -81,7 +81,6 @@ def fuse(
     Raises ScanError (unusable input), RecipeError, ResourceError. What was computed before an error stays in `out`.
     """
     from .alignment import align_thermal
-    from .fusion import fuse_surface
     from .thermometry import measure, see, unmeasured
 
     verify(scan)
@@ -101,7 +100,7 @@ def fuse(
     # 1. Surface
     tracking = run("track", lambda p: locate(scan, recipe, p))
     trajectory = tracking.trajectory
-    surface = run("surface", lambda p: fuse_surface(scan, trajectory, recipe, floor_plane=tracking.floor_plane))
+    surface = run("surface", lambda p: fuse_subject(scan, tracking, recipe, p))
     alignment = seen = temperature = None
     if surface is not None and scan.thermal is None:
         temperature = unmeasured(scan, surface.mesh, recipe, _axes(scan, tracking, surface))
@@ -136,7 +135,18 @@ def locate(scan: Scan, recipe: Recipe, progress: Progress) -> TrackingResult:
         return recorded(scan)
     if source == "estimate":
         scan = replace(scan, trajectory=None)
-    return track(scan, recipe)
+    return track(scan, recipe, progress=progress)
+
+
+def fuse_subject(scan: Scan, tracking: TrackingResult, recipe: Recipe, progress: Progress) -> FusionResult:
+    """The subject's surface (see `fusion`). Before a standing camera the room is masked out as in tracking."""
+    from .fusion import fuse_surface
+    from .segmentation import SubjectFrames
+
+    frames = SubjectFrames(scan, recipe) if recipe.subject.motion == "subject" else None
+    return fuse_surface(
+        scan, tracking.trajectory, recipe, progress=progress, floor_plane=tracking.floor_plane, frames=frames
+    )
 
 
 def plan(scan: Scan, recipe: Recipe, out: Path, *, redo_from: str | None = None) -> list[StagePlan]:

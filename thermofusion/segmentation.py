@@ -6,14 +6,14 @@ while the camera walks (820 mm adrift on a whole-body scan, 4 mm without them). 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .depthfilter import DepthFrames
+from .depthfilter import DepthFrames, read_ahead
 from .geometry import pixel_rays
 from .recipe import Recipe
 from .types import Bool, Camera, Float, Float32, Scan
@@ -76,6 +76,10 @@ class SubjectFrames:
         if self._subject.background == "remove":
             depth[behind_subject(depth)] = np.nan
         return depth
+
+    def read_ahead(self, frames: Sequence[int], *, workers: int = 2) -> Iterator[tuple[int, Float32]]:
+        """(i, frame i) in the order given, a few frames ahead on threads."""
+        return zip(frames, read_ahead(self.load, frames, workers=workers), strict=True)
 
 
 def find_floor(depth_m: Float32, rays: Float32, *, seed: int = 0) -> FloorPlane | None:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import islice
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from .._open3d import o3d
+from ..depthfilter import read_ahead
 from ..geometry import invert, project, rotation_angle_deg, transform_points
 from ..recipe import Recipe
 from ..scans.pairing import pair_color
@@ -58,13 +57,7 @@ class HalfFrames:
 
     def read_ahead(self, indices: NDArray[np.intp]) -> Iterator[Frame]:
         """Frames in order, a few decoded ahead."""
-        with ThreadPoolExecutor(2) as pool:
-            todo = iter(indices.tolist())
-            pending = [pool.submit(self.load, i) for i in islice(todo, 4)]
-            while pending:
-                result = pending.pop(0)
-                pending.extend(pool.submit(self.load, j) for j in islice(todo, 1))
-                yield result.result()
+        return read_ahead(self.load, indices.tolist())
 
     def _intensity(self, i: int, depth: Float32) -> Float32 | None:
         """Brightness of the colour image at every depth pixel."""
