@@ -63,9 +63,8 @@ class BlendResult:
         """Blocks of vertices, one after the other."""
         names = [f for f in cls.__dataclass_fields__ if f not in ("output", "uncertainty")]
         arrays = {name: np.concatenate([getattr(b, name) for b in blocks]) for name in names}
-        parts = blocks[0].uncertainty.parts_K
-        joined = {k: np.concatenate([b.uncertainty.parts_K[k] for b in blocks]) for k in parts}
-        return cls(output=blocks[0].output, uncertainty=Uncertainty.of(joined), **arrays)
+        uncertainty = Uncertainty.joined([b.uncertainty for b in blocks])
+        return cls(output=blocks[0].output, uncertainty=uncertainty, **arrays)
 
     @property
     def temperature_K(self) -> Float:

@@ -141,7 +141,7 @@ class RadiometrySection(_Section):
     transmission_per_m: float = Field(
         1.0, gt=0, le=1, description="of the air path; 1 = neglected, its size stands in the budget"
     )
-    sigma_reflected_K: float = Field(1.0, ge=0, description="uncertainty of the reflected temperature")
+    sigma_reflected_K: float = Field(0.5, ge=0, description="of the reflected temperature, measured with crumpled foil")
     sigma_normal_deg: float | None = Field(
         None, ge=0, description="of surface normals; None = estimated from depth noise and window"
     )

@@ -6,6 +6,7 @@ that the camera reports, so that 1/Σσ² is the observation's statistical weigh
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -96,22 +97,54 @@ def skin_slope(band: Band, radiance: NDArray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """One sigma per vertex, K, and its parts (V,) float32; total² = Σ parts². NaN = unmeasured.
+    """One sigma of a result: per vertex, and of the level common to all vertices. K; NaN = unmeasured.
 
-    noise : of the pixels. calibration : offsets and field of the views. shape : of ε(θ). emissivity0 : ε(0), absolute
-    only. reference : what set the level (0 for a relative result: its level is unknown). reflected : T_refl. normals :
-    of the surface. registration : thermal image on a temperature gradient. air : the air path. views : how far views
-    disagree, for methods that do not calibrate them.
+    What errs from vertex to vertex and what shifts all vertices together are kept apart: the first decides whether a
+    difference within the result is real, the second whether its level is. For one vertex's absolute temperature both
+    count: √(total² + level²).
+
+    total_K : (V,) float32, one sigma about the common level; total² = Σ parts². parts_K : (V,) each.
+        noise : of the pixels. calibration : offsets and field of the views. shape : of ε(θ), where it is not fitted.
+        normals : of the surface. registration : thermal image on a temperature gradient. air : differences in the air
+        path. emissivity0, reflected : what errors of ε(0) and T_refl do beyond their common shift. views : how far
+        views disagree, for methods that do not calibrate them.
+    level_parts_K : reference, emissivity0, reflected: one number each. A relative result has no reference: its level is
+        unknown beyond these.
     """
 
     total_K: Float32
     parts_K: dict[str, Float32]
+    level_parts_K: dict[str, float]
+    common_K: dict[str, Float32]  # signed effect per vertex of one sigma of what is common
 
     @classmethod
-    def of(cls, parts_K: dict[str, NDArray]) -> Uncertainty:
+    def of(cls, parts_K: dict[str, NDArray], common_K: dict[str, NDArray] | None = None) -> Uncertainty:
+        """From parts of single vertices and signed effects (V,) of common errors."""
         parts = {name: np.asarray(value, np.float32) for name, value in parts_K.items()}
+        common = {name: np.asarray(value, np.float32) for name, value in (common_K or {}).items()}
+        level = {}
+        for name, effect in common.items():
+            known = effect[np.isfinite(effect)]
+            level[name] = float(np.median(known)) if len(known) else 0.0
+            if len(known) and np.ptp(known) > 0:
+                parts[name] = np.abs(effect - np.float32(level[name]))
         total = np.sqrt(np.sum([p.astype(np.float64) ** 2 for p in parts.values()], axis=0))
-        return cls(total.astype(np.float32), parts)
+        return cls(total.astype(np.float32), parts, {k: abs(v) for k, v in level.items()}, common)
+
+    @classmethod
+    def joined(cls, blocks: Sequence[Uncertainty]) -> Uncertainty:
+        """Blocks of vertices, one after the other."""
+
+        def join(pieces: Sequence[dict[str, Float32]], names: Iterable[str]) -> dict[str, NDArray]:
+            return {k: np.concatenate([p[k] for p in pieces]) for k in names}
+
+        own = [k for k in blocks[0].parts_K if k not in blocks[0].common_K]
+        return cls.of(join([b.parts_K for b in blocks], own), join([b.common_K for b in blocks], blocks[0].common_K))
+
+    @property
+    def level_K(self) -> float:
+        """One sigma of the common level."""
+        return float(np.sqrt(sum(v**2 for v in self.level_parts_K.values())))
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,19 +203,20 @@ def vertex_uncertainty(
         "noise": scale * errors.netd_K * slope_L * np.sqrt(BILINEAR_VARIANCE * levers.squared),
         "calibration": scale * np.sqrt((levers.modes**2).sum(1)),
         "shape": zero if shape_fitted else scale * np.abs(x * levers.loss) * errors.sigma_shape,
-        "emissivity0": scale * np.abs(x) / epsilon0 * sigma_epsilon0 if absolute else zero,
-        "reference": zero
-        + (reference_sigma_K / (epsilon0 if absolute else 1.0) if np.isfinite(reference_sigma_K) else 0),
-        "reflected": np.abs(reflected) * errors.sigma_reflected_K * slope_reflected / slope_L,
         "normals": scale * np.abs(x) * tilt * normal,
         "registration": np.asarray(errors.gradient_K_per_m) * levers.registration_m,
         "air": zero if air_K is None else np.abs(T_K - air_K) * air_loss * path,
-        "views": zero if views_K is None else np.nan_to_num(views_K),
+    }
+    if views_K is not None:
+        parts["views"] = np.nan_to_num(views_K)
+    common = {
+        "reference": zero + np.nan_to_num(reference_sigma_K) / (epsilon0 if absolute else 1.0),
+        "emissivity0": scale * x / epsilon0 * sigma_epsilon0 if absolute else zero,
+        "reflected": reflected * errors.sigma_reflected_K * slope_reflected / slope_L,
     }
     unmeasured = ~np.isfinite(T_K)
-    return Uncertainty.of(
-        {k: np.where(unmeasured, np.nan, v) for k, v in parts.items() if k != "views" or views_K is not None}
-    )
+    masked = ({k: np.where(unmeasured, np.nan, v) for k, v in group.items()} for group in (parts, common))
+    return Uncertainty.of(*masked)
 
 
 def covariance_modes(covariance: Float, count: int) -> Float:
