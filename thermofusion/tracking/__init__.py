@@ -1,7 +1,7 @@
 """Where the depth camera was: odometry, fragments, loops, one joint solution, frames against the model.
 
-1. Frame to frame (Open3D's dense odometry on half-resolution depth, subject only), judged step by step; a step that
-   fails begins a new segment.
+1. Frame to frame, point to plane on half-resolution depth, subject only; colour helps where shape says too little.
+   Every step is judged; one that fails begins a new segment.
 2. Every few frames become a fragment: their depth averaged in the middle frame's view.
 3. Segments that lost each other are joined again, by time, place or shape; what cannot be joined is left out, and said.
 4. All fragments that see the same surface pull on each other, point to plane, in one solution (loops included).
@@ -220,7 +220,7 @@ def _refined(placed: list[_Placed]) -> list[Float]:
             turn = np.arccos(np.clip(centres[:, :3, 2] @ T[:3, 2], -1, 1))
             near = np.argsort(turn + np.linalg.norm(centres[:, :3, 3] - T[:3, 3], axis=1), kind="stable")
             targets = [(fragments[k][0].map, fragments[k][1]) for k in near[:FRAME_TARGETS]]
-            aligned, partners = register(p.segment.samples[n], targets, T, FRAME_REACHES_M)
+            aligned, partners = register(p.segment.samples[n], targets, T, FRAME_REACHES_M, stride=2)
             if partners is not None and np.linalg.norm(aligned[:3, 3] - T[:3, 3]) < FRAME_REACHES_M[0]:
                 poses[n] = aligned
         out.append(poses)

@@ -22,13 +22,12 @@ MIN_SHARE = 1 / 3  # of the frames that must see a pixel
 class Frame:
     """A depth frame as tracking uses it: half resolution, subject only.
 
-    depth_m : (H, W) float32, NaN = none. intensity : (H, W) float32 0..1 of the colour camera, or None.
+    depth_m : (H, W) float32, NaN = none.
     """
 
     index: int
     time_s: float
     depth_m: Float32
-    intensity: Float32 | None
 
     @property
     def empty(self) -> bool:

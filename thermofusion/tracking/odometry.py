@@ -1,4 +1,4 @@
-"""Frame to frame: dense odometry on half-resolution depth, colour as help, and the moment it fails."""
+"""Frame to frame: point to plane on half-resolution depth, colour where shape says too little, and when it fails."""
 
 from __future__ import annotations
 
@@ -17,11 +17,13 @@ from ..scans.pairing import pair_color
 from ..segmentation import SubjectFrames
 from ..types import Float, Float32, Scan
 from .fragments import Fragment, Frame, build_fragment
-from .registration import DepthMap, find_partners, register
+from .registration import DepthMap, Partners, find_partners, register
 
-LEVELS = (6, 10)  # iterations, coarse to fine
-OUTLIER_M = 0.05
-SAMPLES = 1500  # points that judge a motion
+SAMPLES = 3000  # points of a frame that are sent to its neighbour
+REACHES_M = (0.06, 0.05, 0.04, 0.03, 0.02, 0.02, 0.015, 0.015)
+WEAK_GEOMETRY = 1e-3  # smallest to largest eigenvalue of the motion's information: a wall, a table
+COLOR_LEVELS = (6, 10)  # iterations of the dense odometry with colour, coarse to fine
+COLOR_OUTLIER_M = 0.05
 MAX_SPEED_M_S, MAX_SPEED_DEG_S = 2.5, 180.0  # faster is no walk: a failure
 MIN_STEP_M, MIN_STEP_DEG = 0.06, 6.0
 REACH_M = 0.05
@@ -42,31 +44,32 @@ class HalfFrames:
         K = self.subject.camera.K
         self.intrinsics = (K[0, 0] / 2, K[1, 1] / 2, K[0, 2] / 2, K[1, 2] / 2)
         self._color_of = None
-        # Colour sees texture that geometry has not: walls, tables. A body before an empty background is all geometry.
-        if recipe.tracking.color and recipe.subject.background == "keep" and scan.color is not None:
+        if recipe.tracking.color and scan.color is not None:
             self._color_of = pair_color(scan, recipe.input.pair_tolerance_ms).color_index
 
     @property
-    def uses_color(self) -> bool:
+    def has_color(self) -> bool:
+        """Whether there is colour, and the recipe lets it help."""
         return self._color_of is not None
 
     def load(self, i: int) -> Frame:
         """Frame i of the depth stream."""
         depth = np.ascontiguousarray(self.subject.load(i)[::2, ::2])
-        return Frame(i, float(self._scan.depth.times_s[i]), depth, self._intensity(i, depth))
+        return Frame(i, float(self._scan.depth.times_s[i]), depth)
 
     def read_ahead(self, indices: NDArray[np.intp]) -> Iterator[Frame]:
         """Frames in order, a few decoded ahead."""
         return read_ahead(self.load, indices.tolist())
 
-    def _intensity(self, i: int, depth: Float32) -> Float32 | None:
-        """Brightness of the colour image at every depth pixel."""
+    def intensity(self, frame: Frame) -> Float32 | None:
+        """Brightness 0..1 of the colour image at every depth pixel (H, W), or None where no colour frame is near."""
         rig, stream = self._scan.rig, self._scan.color
-        if self._color_of is None or self._color_of[i] < 0 or stream is None:
+        if self._color_of is None or self._color_of[frame.index] < 0 or stream is None:
             return None
         assert rig.color is not None
         assert rig.T_color_depth is not None
-        grey = cv2.cvtColor(stream.load(int(self._color_of[i])), cv2.COLOR_RGB2GRAY)
+        grey = cv2.cvtColor(stream.load(int(self._color_of[frame.index])), cv2.COLOR_RGB2GRAY)
+        depth = frame.depth_m
         fx, fy, cx, cy = self.intrinsics
         v, u = np.nonzero(np.isfinite(depth))
         z = depth[v, u]
@@ -123,21 +126,23 @@ class GrowingSegment:
         self._fragments: list[Fragment] = []
         self._pending: list[Frame] = []
         self._append(frame, np.eye(4) if T is None else T, self._map_of(frame), np.nan, np.nan)
-        self._image, self._motion = _rgbd(frame), np.eye(4)
+        self._motion = np.eye(4)
 
     def take(self, frame: Frame) -> bool:
         """Append a frame if the motion to it can be believed."""
         if frame.index - self._frames[-1] > MAX_GAP_FRAMES:
             return False
-        now, image = self._map_of(frame), _rgbd(frame)
-        for dense in (True, False):
-            T_last_now = self._dense(image) if dense else self._rescue(now)
+        now, last = self._map_of(frame), [(self._map, np.eye(4))]
+        for start, reaches in ((self._motion, REACHES_M), (np.eye(4), RESCUE_REACHES_M)):
+            T_last_now, partners = register(now, last, start, reaches)
+            if partners is not None and self._source.has_color and weak_geometry(partners):
+                T_last_now = self._with_color(frame, T_last_now)
             partners = find_partners(now, self._map, T_last_now, REACH_M)
             gate = self._recipe.tracking
             believed = partners.share >= gate.min_fitness and partners.residual_mm_at_1m <= gate.max_residual_mm
             if believed and self._possible(T_last_now, frame.time_s - self._last.time_s):
                 self._append(frame, self._T[-1] @ T_last_now, now, partners.share, partners.residual_mm_at_1m)
-                self._image, self._motion = image, T_last_now
+                self._motion = T_last_now
                 return True
         return False
 
@@ -179,32 +184,24 @@ class GrowingSegment:
     def _map_of(self, frame: Frame) -> DepthMap:
         return DepthMap.of(frame.depth_m, self._source.intrinsics, SAMPLES)
 
-    def _dense(self, image: o3d.t.geometry.RGBDImage) -> Float:
-        """Open3D's multi-scale odometry: point to plane, with colour where there is any. T_last_now."""
-        o, start = o3d.t.pipelines.odometry, self._motion
+    def _with_color(self, frame: Frame, start: Float) -> Float:
+        """Open3D's dense odometry with depth and colour, T_last_now; `start` where it cannot tell either."""
+        images = [_rgbd(f, self._source.intensity(f)) for f in (frame, self._last)]
+        if images[0] is None or images[1] is None:
+            return start
+        o = o3d.t.pipelines.odometry
         fx, fy, cx, cy = self._source.intrinsics
         K = o3d.core.Tensor(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]))
-        method = o.Method.Hybrid if self._source.uses_color else o.Method.PointToPlane
+        levels = [o.OdometryConvergenceCriteria(n) for n in COLOR_LEVELS]
+        loss = o.OdometryLossParams(COLOR_OUTLIER_M)
         try:
             result = o.rgbd_odometry_multi_scale(
-                image,
-                self._image,
-                K,
-                o3d.core.Tensor(start),
-                1.0,
-                10.0,
-                [o.OdometryConvergenceCriteria(n) for n in LEVELS],
-                method,
-                o.OdometryLossParams(OUTLIER_M),
+                *images, K, o3d.core.Tensor(start), 1.0, 10.0, levels, o.Method.Hybrid, loss
             )
         except RuntimeError:  # a singular system: too little in common
             return start
         T = result.transformation.numpy().astype(np.float64)
         return T if np.isfinite(T).all() else start
-
-    def _rescue(self, now: DepthMap) -> Float:
-        """A second try from standing still, with a far reach: for a jerk that the last motion did not announce."""
-        return register(now, [(self._map, np.eye(4))], np.eye(4), RESCUE_REACHES_M)[0]
 
     def _possible(self, T: Float, dt_s: float) -> bool:
         dt_s = max(dt_s, 1e-3)
@@ -212,13 +209,22 @@ class GrowingSegment:
         return bool(near and rotation_angle_deg(T) <= max(MAX_SPEED_DEG_S * dt_s, MIN_STEP_DEG))
 
 
-def _rgbd(frame: Frame) -> o3d.t.geometry.RGBDImage:
-    depth = np.nan_to_num(frame.depth_m)
+def weak_geometry(partners: Partners) -> bool:
+    """Whether the partners' planes leave some motion nearly free: all of them parallel, or round one axis."""
+    p, n = partners.points, partners.normals
+    if len(n) < 6:
+        return True
+    centred = p - p.mean(0)
+    size = np.sqrt((centred**2).sum(1).mean())
+    J = np.concatenate([np.cross(centred / size, n), n], axis=1)
+    values = np.linalg.eigvalsh(J.T @ J)
+    return bool(values[0] < WEAK_GEOMETRY * values[-1])
+
+
+def _rgbd(frame: Frame, intensity: Float32 | None) -> o3d.t.geometry.RGBDImage | None:
+    if intensity is None:
+        return None
     image = o3d.t.geometry.RGBDImage()
-    image.depth = o3d.t.geometry.Image(o3d.core.Tensor(depth))
-    if frame.intensity is None:
-        image.color = image.depth
-    else:
-        grey = np.repeat(frame.intensity[..., None], 3, axis=2)
-        image.color = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(grey)))
+    image.depth = o3d.t.geometry.Image(o3d.core.Tensor(np.nan_to_num(frame.depth_m)))
+    image.color = o3d.t.geometry.Image(o3d.core.Tensor(np.repeat(intensity[..., None], 3, axis=2)))
     return image

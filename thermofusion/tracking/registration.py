@@ -182,7 +182,7 @@ def solve_jointly(
     *,
     fixed: int = 0,
     max_iterations: int = 8,
-    tolerance: float = 2e-5,
+    tolerance: float = 1e-4,
 ) -> tuple[Float, float, bool]:
     """All poses (F, 4, 4) T_world_map at once, from point-to-plane residuals over all edges (source, target).
 
