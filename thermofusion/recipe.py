@@ -11,7 +11,7 @@ import json
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_origin
 
 import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
@@ -251,6 +251,31 @@ def find_recipe(source: str | Path) -> Path:
 def shipped_recipes() -> list[str]:
     """Names of the recipes that come with the package."""
     return sorted(p.stem for p in recipes_dir().glob("*.toml"))
+
+
+def key_reference() -> str:
+    """Every key of the tree with its default and meaning, as Markdown tables (docs/recipes.md)."""
+    lines = []
+    for name, section in Recipe.model_fields.items():
+        keys = getattr(section.annotation, "model_fields", None)
+        if not keys:
+            continue
+        lines += [f"## `[{name}]`", "", (section.annotation.__doc__ or "").strip(), ""]
+        lines += ["| key | default | meaning |", "|---|---|---|"]
+        for key, field in keys.items():
+            default = "not set" if field.default is None else json.dumps(field.get_default(call_default_factory=True))
+            choices = " \\| ".join(f"`{c}`" for c in _choices(field.annotation))
+            meaning = "; ".join(part for part in (field.description, choices) if part)
+            lines.append(f"| `{key}` | `{default}` | {meaning} |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _choices(annotation: Any) -> tuple[str, ...]:
+    """The words a key accepts, if it accepts words."""
+    if get_origin(annotation) is Literal:
+        return tuple(str(c) for c in get_args(annotation))
+    return tuple(c for part in get_args(annotation) for c in _choices(part))
 
 
 def _override(tree: dict[str, Any], item: str) -> None:

@@ -10,7 +10,7 @@ import typer
 from .console import emit, note
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
-recipes = typer.Typer(help="The processing recipes: list, show, validate.", no_args_is_help=True)
+recipes = typer.Typer(help="The processing recipes: list, show, validate, keys.", no_args_is_help=True)
 
 
 def register(app: typer.Typer) -> None:
@@ -92,3 +92,11 @@ def recipe_validate(
 
     resolved = load_recipe(recipe, set_ or ())
     emit({"valid": True, "name": resolved.name}, f"{recipe}: valid", json)
+
+
+@recipes.command("keys")
+def recipe_keys(json: Json = False) -> None:
+    """Every key a recipe may have, its default and its meaning."""
+    from ..recipe import Recipe, key_reference
+
+    emit(Recipe.model_json_schema(), key_reference().rstrip(), json)
