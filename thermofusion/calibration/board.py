@@ -21,11 +21,13 @@ class Board:
     Attributes
     ----------
     kind : `checkerboard` (inner corners), `pins` (a metal pin on every corner of the squares), `mask` (square holes
-        before a heated plate; the points are the holes' centres), `circles`, `asymmetric-circles`, `charuco`, `lamps`.
+        before a heated plate; the points are the holes' corners, so both counts are even), `circles`,
+        `asymmetric-circles`, `charuco`, `lamps`.
     columns, rows : points along x and along y. Asymmetric circles: as OpenCV counts them, `columns` points in each
         of `rows` rows, every second row shifted by half a step.
     spacing_m : distance of neighbouring points (asymmetric circles: of neighbouring rows, half the step in a row).
-    mark_ratio : size of the printed mark over the spacing (circle diameter, hole width, marker width).
+    mark_ratio : size of the mark over the spacing (circle diameter, marker width); of a mask: hole width over pitch,
+        the pitch being two spacings.
 
     Raises ScanError for a board that is no grid.
     """
@@ -43,6 +45,8 @@ class Board:
             )
         if self.columns < 2 or self.rows < 2 or self.columns * self.rows > MAX_POINTS:
             raise ScanError(f"a board of {self.columns} x {self.rows} points is not usable", hint="count inner corners")
+        if self.kind == "mask" and (self.columns % 2 or self.rows % 2):
+            raise ScanError("a mask of square holes has an even number of corners each way", hint="two per hole")
         if not 1e-4 < self.spacing_m < 10:
             raise ScanError(f"a spacing of {self.spacing_m} m is not usable", hint="give it in metres")
         if not 0.05 <= self.mark_ratio <= 0.95:
@@ -55,6 +59,9 @@ class Board:
     def points_m(self) -> Float:
         """(N, 3) points in the board frame, row by row, z = 0."""
         v, u = np.divmod(np.arange(len(self)), self.columns)
+        if self.kind == "mask":
+            x, y = (2 * (k // 2 + (k % 2) * self.mark_ratio) * self.spacing_m for k in (u, v))
+            return np.stack([x, y, np.zeros(len(self))], axis=1)
         x = (2 * u + v % 2) if self.kind == "asymmetric-circles" else u
         return np.stack([x * self.spacing_m, v * self.spacing_m, np.zeros(len(self))], axis=1)
 

@@ -41,8 +41,8 @@ def sample_board(
     if len(u) < MIN_PIXELS:
         return None
     y = value[v, u] if disparity else 1 / value[v, u]
-    kept, spread = _on_plane(u, v, y)
-    u, v, y = u[kept], v[kept], y[kept]
+    fitted, kept, spread = _on_plane(u, v, y)
+    u, v, fitted, raw = u[kept], v[kept], fitted[kept], value[v, u][kept]
     if len(u) < MIN_PIXELS:
         return None
     side = max(np.ptp(u), np.ptp(v)) / CELLS + 1e-9
@@ -55,15 +55,16 @@ def sample_board(
     def mean(a: NDArray) -> Float:
         return (np.bincount(which, a) / count)[full]
 
-    m = mean(y)
-    out = m if disparity else 1 / m
-    noise = max(spread, QUANTUM_DISPARITY) if disparity else max(spread, METRIC_NOISE) * out**2
-    sigma = np.broadcast_to(noise, m.shape)
+    # averaged as reported (noise is symmetric there), relative to the plane: mean(1/z) alone would be too near
+    level = mean(fitted)
+    out = level + mean(raw - fitted) if disparity else (1 + mean(raw * fitted - 1)) / level
+    noise: NDArray | float = max(spread, QUANTUM_DISPARITY) if disparity else max(spread, METRIC_NOISE) * out**2
+    sigma = np.broadcast_to(noise, out.shape)
     return DepthSamples(mean(u), mean(v), out, sigma / np.sqrt(np.maximum(count[full] / CORRELATED_PIXELS, 1)))
 
 
-def _on_plane(u: NDArray, v: NDArray, y: Float) -> tuple[NDArray, float]:
-    """Pixels within 4 robust sigmas of the affine fit, and that sigma [unit of y]; started from the median's side."""
+def _on_plane(u: NDArray, v: NDArray, y: Float) -> tuple[Float, NDArray, float]:
+    """The robust affine fit at the pixels, those within 4 sigmas of it, and that sigma [unit of y]."""
     A = np.stack([u - u.mean(), v - v.mean(), np.ones(len(u))], axis=1).astype(np.float64)
     A[:, :2] /= max(np.ptp(u), np.ptp(v), 1)
     w, coefficients, scale = np.ones(len(y)), np.zeros(3), 1.0
@@ -74,4 +75,4 @@ def _on_plane(u: NDArray, v: NDArray, y: Float) -> tuple[NDArray, float]:
         r = y - A @ coefficients
         scale = 1.4826 * float(np.median(np.abs(r))) + 1e-9
         w = 1 / (1 + (r / (2 * scale)) ** 2) ** 2
-    return np.abs(r) < 4 * scale, scale
+    return y - r, np.abs(r) < 4 * scale, scale

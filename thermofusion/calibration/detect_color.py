@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -57,12 +59,16 @@ def upright(grid: Float) -> Float:
 
 def _circles(grey: NDArray, board: Board) -> BoardPoints | None:
     kind = cv2.CALIB_CB_ASYMMETRIC_GRID if board.kind == "asymmetric-circles" else cv2.CALIB_CB_SYMMETRIC_GRID
-    p = cv2.SimpleBlobDetector_Params()
+    make: Any = cv2  # its stubs leave the blob detector out
+    p = make.SimpleBlobDetector_Params()
     p.minArea, p.maxArea = 20, grey.size / 50
     p.minDistBetweenBlobs = 4
     for image in (grey, 255 - grey):  # dark on bright, bright on dark
         found, centers = cv2.findCirclesGrid(
-            image, (board.columns, board.rows), flags=kind | cv2.CALIB_CB_CLUSTERING, blobDetector=cv2.SimpleBlobDetector_create(p)
+            image,
+            (board.columns, board.rows),
+            flags=kind | cv2.CALIB_CB_CLUSTERING,
+            blobDetector=make.SimpleBlobDetector_create(p),
         )
         if found:
             grid = centers.reshape(board.rows, board.columns, 2).astype(np.float64)

@@ -1,8 +1,8 @@
 """Grid points in thermal pictures: dark or bright, broken, partly missing.
 
-A pin is a small spot of either sign. The picture is turned into a signed signal-to-noise map of spots; a predicted grid is
-laid on its absolute value, shifted to where most spots agree, then every point takes its own peak and the grid is bent
-onto them by a homography, in rounds with a shrinking window.
+A pin is a small spot of either sign. The picture is turned into a signed signal-to-noise map of spots; a predicted grid
+is laid on its absolute value, shifted to where most spots agree, then every point takes its own peak and the grid is
+bent onto them by a homography, in rounds with a shrinking window.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def spot_map(image: NDArray, sigma_px: float = SPOT_SIGMA_PX) -> NDArray[np.floa
     d = cv2.GaussianBlur(x, (0, 0), sigma_px) - cv2.GaussianBlur(x, (0, 0), 2.2 * sigma_px)
     spread = 1.4826 * float(np.median(np.abs(d))) + 1e-6
     power = cv2.GaussianBlur(np.minimum(d * d, (3 * spread) ** 2), (0, 0), 12)
-    return d / np.sqrt(np.maximum(power, (0.3 * spread) ** 2))
+    return (d / np.sqrt(np.maximum(power, (0.3 * spread) ** 2))).astype(np.float32)
 
 
 def fixed_pattern(images: list[NDArray]) -> NDArray[np.float32] | None:
@@ -70,7 +70,7 @@ def is_saturated(image: NDArray) -> bool:
 def find_shift(
     spots: NDArray[np.float32], predicted: Float, reach_px: float, *, dilate_px: int = 2
 ) -> tuple[Float, float]:
-    """Shift (2,) px of a predicted grid (N, 2), within `reach_px`, at which most points lie on spots, and the mean score.
+    """Shift (2,) px of a predicted grid (N, 2), within `reach_px`, at which most points lie on spots; mean score.
 
     The score of a point is its |SNR| capped at 6 within `dilate_px`: many fair points beat a few bright ones.
     """
@@ -166,6 +166,6 @@ def _parabola(a: NDArray, b: NDArray, c: NDArray) -> NDArray:
     return np.where(d < -1e-9, np.clip(0.5 * (a - c) / np.where(d < -1e-9, d, 1), -0.6, 0.6), 0.0)
 
 
-def _apply(H: Float, px: Float) -> Float:
+def _apply(H: NDArray, px: Float) -> Float:
     q = np.column_stack([px, np.ones(len(px))]) @ H.T
     return q[:, :2] / q[:, 2:]

@@ -58,7 +58,7 @@ def register_dropouts(image: NDArray, camera: Camera, T_depth_board: Float, boar
         return None
     pattern = np.where(inside, (np.floor(x) + np.floor(y)) % 2, 0).astype(np.float32)
     pattern[inside] -= pattern[inside].mean()
-    score = cv2.matchTemplate(region, pattern, cv2.TM_CCORR)
+    score: NDArray = cv2.matchTemplate(region, pattern, cv2.TM_CCORR)
     score = score / float(np.sqrt((pattern**2).sum() * inside.sum() * share * (1 - share)))
     j, i = np.unravel_index(np.argmax(np.abs(score)), score.shape)
     if abs(score[j, i]) < MIN_CORRELATION or not (0 < j < score.shape[0] - 1 and 0 < i < score.shape[1] - 1):

@@ -33,6 +33,7 @@ DEPTH_PLACE_M = (
     0.015,
 )  # of the depth camera's place about the guess, hub axes: pupils on one frame stand side
 # by side, not behind each other; boards alone trade that distance against the depth scale
+PLANE_FLOOR = 1e-4  # m at 1 m: no depth camera is truer than this over a whole plane, however many pixels it averages
 MIN_MARKED_VIEWS = 4
 KINECT_FOCAL = 585.0 / 640.0  # image widths; structured-light and many time-of-flight cameras lie near it
 
@@ -76,13 +77,15 @@ def calibrate_views(
     depth_camera: Camera | None = None,
     depth_kind: str = "metric",
     T_depth_hub: Float | None = None,
+    depth_lens_known: bool = False,
     free_spacing: bool = False,
     group: int | None = None,
 ) -> Calibration:
     """Cameras, rig and depth from what was seen of the board.
 
     depth_images : view name -> loader of metres (NaN none) or, for depth_kind `disparity`, of raw disparity.
-    depth_camera : its data sheet (default: a Kinect's field of view). T_depth_hub : first guess, default identity.
+    depth_camera : its data sheet (default: a Kinect's field of view), or with `depth_lens_known` the maker's own
+    calibration of this very camera, which is then held. T_depth_hub : first guess, default identity.
     free_spacing : estimate the board's spacing; depth must then be true in scale. group : which state of the rig to
     report where it moved; default the one with most views.
 
@@ -108,7 +111,9 @@ def calibrate_views(
         points = fit
         for _ in range(3):  # again, knowing where the board lies in the depth image
             seen = _with_depth(data, depth_images, lens, T, fit.board_poses(), depth_kind, margin)
-            fit, extra = _add_depth(points, seen, single, groups, model, depth_camera or lens, T, guess, free_spacing)
+            fit, extra = _add_depth(
+                points, seen, single, groups, model, depth_camera or lens, T, guess, free_spacing, depth_lens_known
+            )
             lens = camera_of(fit.block("depth"), size)
             T, margin = from_rt(fit.block(f"T_depth_{fit.problem.hub}")), 0.0
         data, more = seen, more + extra
@@ -198,6 +203,7 @@ def _add_depth(
     T_depth_hub: Float,
     T_guess: Float,
     free_spacing: bool,
+    depth_lens_known: bool,
 ) -> tuple[Fit, list[str]]:
     """Depth planes on top of the point cameras' fit: first alone against held boards, which shows how far whole planes
     miss; then everything together with that as their weight."""
@@ -218,6 +224,8 @@ def _add_depth(
     x[problem.slices["depth_model"]] = model.start()
     fixed = set(fit.options.fixed) - {"spacing"}
     fixed |= {"depth_model"} if free_spacing else {"spacing"}
+    if depth_lens_known:
+        fixed.add("depth")
     held = frozenset(fixed | {k for k in fit.problem.slices if k not in ("spacing", "depth", key)})
     priors = _priors(single, problem, depth_camera)
     if "depth" not in single:
@@ -288,7 +296,10 @@ def _depth_sigma(alone: Fit, points: Fit) -> float:
         var = Jv @ points.covariance[np.ix_(np.maximum(c, 0), np.maximum(c, 0))] @ Jv
         excess.append((np.median(r[rows]) ** 2 - var) / scale**2 - 1.6 / rows.sum())
     n = len(r) / len(excess)
-    rho = float(np.clip(np.mean(np.minimum(excess, 9.0)), 0, 9.0))
+    middle = float(np.median(problem.depth.value))
+    floor = 0.0 if isinstance(problem.depth_model, DisparityDepth) else (PLANE_FLOOR * middle**2) ** 2
+    floor /= (scale * float(np.median(problem.depth.sigma))) ** 2
+    rho = float(np.clip(np.mean(np.minimum(excess, 9.0)), floor, 9.0))
     return scale * float(np.sqrt(1 + n * rho))
 
 

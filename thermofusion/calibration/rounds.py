@@ -1,8 +1,8 @@
-"""Thermal boards found without picks: from the colour camera's boards, in rounds, each with the calibration of the last.
+"""Thermal boards found without picks: from the colour camera's, in rounds, each with the calibration of the last.
 
-First, with nothing known, the colour camera's board poses give the grid's shape in every view; the thermal picture shows
-it scaled by one focal length and turned by one roll, common to all views, and shifted. What is found calibrates the thermal
-camera, which predicts the board in the views still missing.
+First, with nothing known, the colour camera's board poses give the grid's shape in every view; the thermal picture
+shows it scaled by one focal length and turned by one roll, common to all views, and shifted. What is found calibrates
+the thermal camera, which predicts the board in the views still missing.
 """
 
 from __future__ import annotations
@@ -60,7 +60,9 @@ class ThermalPictures:
         return spot_map(self.clean[name], float(np.clip(0.04 * step, SPOT_SIGMA_PX, 1.8)))
 
 
-def detect_thermal_set(data: CalibrationSet, images: Mapping[str, NDArray]) -> tuple[CalibrationSet, dict[str, Detection]]:
+def detect_thermal_set(
+    data: CalibrationSet, images: Mapping[str, NDArray]
+) -> tuple[CalibrationSet, dict[str, Detection]]:
     """Thermal points of all views from `images` (H, W) counts by view name; `data` has colour points.
 
     Returns the set with thermal points, and every view's detection (accepted and rejected points).
@@ -156,7 +158,7 @@ def _turned(xy: Float, roll_deg: float) -> Float:
 
 def _shrink(image: NDArray[np.float32]) -> NDArray[np.float32]:
     h, w = image.shape
-    return cv2.resize(image, (w // COARSE, h // COARSE), interpolation=cv2.INTER_AREA)
+    return cv2.resize(image, (w // COARSE, h // COARSE), interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
 def _size(images: Mapping[str, NDArray]) -> tuple[int, int]:

@@ -29,7 +29,9 @@ class SimulatedRig:
     color: Camera = field(default_factory=lambda: _camera(1280, 960, 1052.0, (8, -11), (0.05, -0.1, 0.001, -0.001, 0)))
     thermal: Camera = field(default_factory=lambda: _camera(640, 480, 800.0, (-6, 9), (-0.25, 0.2, 0.0, 0.001, 0)))
     depth: Camera = field(default_factory=lambda: _camera(640, 480, 585.0, (2, -1), (0, 0, 0, 0, 0)))
-    T_color_depth: Float = field(default_factory=lambda: se3_exp(np.array([0.004, -0.006, 0.002, -0.025, 0.001, -0.003])))
+    T_color_depth: Float = field(
+        default_factory=lambda: se3_exp(np.array([0.004, -0.006, 0.002, -0.025, 0.001, -0.003]))
+    )
     T_thermal_depth: Float = field(default_factory=lambda: se3_exp(np.array([0.05, 0.02, -0.01, 0.01, -0.09, -0.02])))
 
     def camera(self, name: str) -> Camera:
@@ -122,7 +124,13 @@ def plane_depth(rig: SimulatedRig, T_depth_board: Float, noise_m: float, seed: i
 
 
 def thermal_picture(
-    rig: SimulatedRig, T_depth_board: Float, seed: int, *, blur_px: float = 1.0, noise: float = 5.0, missing: float = 0.1
+    rig: SimulatedRig,
+    T_depth_board: Float,
+    seed: int,
+    *,
+    blur_px: float = 1.0,
+    noise: float = 5.0,
+    missing: float = 0.1,
 ) -> NDArray[np.uint16]:
     """(H, W) counts: pins of either sign on a board with a slow gradient, optical blur, pixel noise, some pins gone.
 
@@ -131,7 +139,7 @@ def thermal_picture(
     rng, camera = np.random.default_rng(seed), rig.thermal
     fine = 4
     px = true_pixels(rig, "thermal", T_depth_board)
-    image = np.zeros((camera.height_px * fine, camera.width_px * fine), np.float32)
+    image: NDArray = np.zeros((camera.height_px * fine, camera.width_px * fine), np.float32)
     across = np.sin(np.linspace(0, np.pi, rig.board.columns) + rng.uniform(0, 3))
     contrast = rng.uniform(25, 90, len(px)) * np.sign(np.tile(across, rig.board.rows) + rng.normal(0, 0.3, len(px)))
     contrast[rng.random(len(px)) < missing] = 0

@@ -1,0 +1,171 @@
+"""`calibrate`: a folder of board pictures in, a rig out, with the points found, the report and what to record next."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ScanError
+from ..types import Float, UInt8
+from .board import Board
+from .coverage import advice, coverage
+from .detect_blobs import detect_blobs
+from .detect_color import detect_color
+from .detect_thermal import is_saturated
+from .folder import CalibrationFolder, open_folder
+from .picks import read_picks_csv, read_picks_mat
+from .pictures import draw_points
+from .rig import Calibration, calibrate_views
+from .rounds import detect_thermal_set
+from .views import BoardPoints, CalibrationSet, View
+
+MIN_SHARE_FOUND = 0.3  # of the pictures; below this the board described is not the one in view
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Calibrated:
+    """The result. rejected_px : camera -> view -> (N, 2) places of board points that were looked for and not taken.
+    found : camera -> number of views with the board. advice : what to record next."""
+
+    folder: CalibrationFolder
+    calibration: Calibration
+    rejected_px: dict[str, dict[str, Float]] = field(default_factory=dict)
+    found: dict[str, int] = field(default_factory=dict)
+    advice: tuple[str, ...] = ()
+
+    def picture(self, camera: str, name: str) -> UInt8:
+        """(H, W, 3) RGB: the view's picture with accepted points as green rings, rejected ones as red crosses."""
+        image = getattr(self.folder, camera)(name)
+        view = next((v for v in self.calibration.data.views if v.name == name), None)
+        points = view.points.get(camera) if view is not None else None
+        accepted = np.zeros((0, 2)) if points is None else points.px
+        return draw_points(image, accepted, self.rejected_px.get(camera, {}).get(name))
+
+
+def calibrate(
+    root: Path | str,
+    *,
+    config: Mapping[str, Any] | None = None,
+    board: Board | None = None,
+    picks: Path | None = None,
+    free_spacing: bool | None = None,
+    group: int | None = None,
+    progress: Progress = lambda _: None,
+) -> Calibrated:
+    """Calibrate from a folder (see `folder`). picks : CSV or picks.mat used instead of detection where it has points.
+
+    Raises ScanError with the next step: no board found, board of another size, parallel views, mirrored or saturated
+    pictures.
+    """
+    folder = open_folder(Path(root), config=config, board=board)
+    source = picks or folder.picks
+    rejected: dict[str, dict[str, Float]] = {}
+    if source is not None:
+        data = _from_picks(folder, source)
+    else:
+        data, rejected = _detect(folder, progress)
+    depth: dict[str, Callable[[], NDArray]] = {
+        n: _loader(folder, n) for n in folder.files.get("depth", {}) if any(v.name == n for v in data.views)
+    }
+    progress("adjusting all cameras together")
+    result = calibrate_views(
+        data,
+        depth_images=depth or None,
+        depth_camera=folder.depth_camera,
+        depth_kind=folder.depth_kind,
+        depth_lens_known=folder.depth_lens_known,
+        T_depth_hub=folder.T_depth_color,
+        free_spacing=folder.free_spacing if free_spacing is None else free_spacing,
+        group=group,
+    )
+    found = {c: len(data.seen_by(c)) for c in data.cameras}
+    next_steps = tuple(s for c in result.single for s in advice(coverage(result, c)))
+    return Calibrated(folder, result, rejected, found, next_steps)
+
+
+def _loader(folder: CalibrationFolder, name: str) -> Callable[[], NDArray]:
+    return lambda: folder.depth(name)
+
+
+def _from_picks(folder: CalibrationFolder, path: Path) -> CalibrationSet:
+    if path.suffix == ".mat":
+        board, sizes, views = read_picks_mat(path, folder.board.spacing_m)
+        if (board.columns, board.rows) != (folder.board.columns, folder.board.rows):
+            raise ScanError(
+                f"the picks are of a board of {board.columns} x {board.rows} points, the folder's has "
+                f"{folder.board.columns} x {folder.board.rows}",
+                place=path,
+            )
+        return CalibrationSet(board, sizes, tuple(views))
+    views = read_picks_csv(path, folder.board)
+    sizes = {}
+    for camera in ("color", "thermal"):
+        if folder.files.get(camera):
+            image = getattr(folder, camera)(next(iter(folder.files[camera])))
+            sizes[camera] = (image.shape[1], image.shape[0])
+    return CalibrationSet(folder.board, sizes, tuple(sorted(views, key=lambda v: v.name)))
+
+
+def _detect(folder: CalibrationFolder, progress: Progress) -> tuple[CalibrationSet, dict[str, dict[str, Float]]]:
+    """Points of both cameras: patches directly; pins in the thermal camera from the colour camera's boards."""
+    views = {n: View(n) for n in folder.names}
+    sizes: dict[str, tuple[int, int]] = {}
+    by_patch = folder.board.kind in ("mask", "circles", "asymmetric-circles", "lamps")
+    if "color" in folder.files:
+        progress("looking for the board in the colour pictures")
+        found, sizes["color"] = _find(folder, "color", detect_color if not by_patch else detect_patches)
+        views = {n: v.with_points("color", found.get(n)) for n, v in views.items()}
+    rejected: dict[str, dict[str, Float]] = {}
+    if "thermal" not in folder.files:
+        return CalibrationSet(folder.board, sizes, tuple(views.values())), rejected
+    progress("looking for the board in the thermal pictures")
+    if by_patch or "color" not in folder.files:
+        found, sizes["thermal"] = _find(folder, "thermal", detect_patches)
+        views = {n: v.with_points("thermal", found.get(n)) for n, v in views.items()}
+        return CalibrationSet(folder.board, sizes, tuple(views.values())), rejected
+    images = {n: folder.thermal(n) for n in folder.files["thermal"]}
+    data, detections = detect_thermal_set(CalibrationSet(folder.board, sizes, tuple(views.values())), images)
+    rejected["thermal"] = {n: d.tried[~d.accepted] for n, d in detections.items()}
+    return data, rejected
+
+
+def detect_patches(image: NDArray, board: Board) -> BoardPoints | None:
+    """Circles, holes and lamps in any picture; checkerboards under a lamp by the colour detector on the grey values."""
+    if board.kind in ("mask", "circles", "lamps"):
+        return detect_blobs(image, board)
+    lo, hi = np.percentile(image, [0.5, 99.5])
+    grey = np.clip((image.astype(np.float32) - lo) * (255 / max(hi - lo, 1e-6)), 0, 255).astype(np.uint8)
+    return detect_color(grey, board) or detect_color(255 - grey, board)
+
+
+def _find(
+    folder: CalibrationFolder, camera: str, detector: Callable[[NDArray, Board], BoardPoints | None]
+) -> tuple[dict[str, BoardPoints], tuple[int, int]]:
+    found, shapes, saturated = {}, set(), 0
+    for name in folder.files[camera]:
+        image = getattr(folder, camera)(name)
+        shapes.add(image.shape[:2])
+        saturated += camera == "thermal" and is_saturated(image)
+        points = detector(image, folder.board)
+        if points is not None:
+            found[name] = points
+    if len(shapes) != 1:
+        raise ScanError(f"the {camera} pictures differ in size", place=folder.root, hint="keep one camera to a folder")
+    count = len(folder.files[camera])
+    if len(found) < max(3, MIN_SHARE_FOUND * count):
+        board = folder.board
+        if saturated > count / 2:
+            cause, hint = f"{saturated} of {count} thermal pictures are saturated", "widen the temperature range"
+        else:
+            what = f"a {board.kind} of {board.columns} x {board.rows} points"
+            cause = f"{what} was found in {len(found)} of {count} {camera} pictures"
+            hint = "check columns and rows (inner corners), and that the whole board, and only one, is in view"
+        raise ScanError(cause, place=folder.root, hint=hint)
+    h, w = shapes.pop()
+    return found, (int(w), int(h))

@@ -1,0 +1,214 @@
+"""A calibration folder: pictures of the board by camera, and calibration.json that says what they are.
+
+```json
+{"board": {"kind": "pins", "columns": 9, "rows": 9, "spacing_m": 0.0762},
+ "files": {"color": "color/*.png", "thermal": "thermal/*.png", "depth": "depth/*.png"},
+ "depth": {"unit_m": 0.001, "invalid": [0], "kind": "metric",
+           "camera": {"width_px": 640, "height_px": 480, "K": [[...]]}, "lens_known": false},
+ "thermal_raw": {"width_px": 632, "height_px": 476, "big_endian": true, "header_bytes": 0},
+ "picks": "picks.csv", "free_spacing": false, "mirrored": []}
+```
+The star in a pattern is the view's name: the same name in two patterns is the same moment. Only `board` is required.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from ..errors import ScanError
+from ..scans.files import depth_from_raw, inside, read_image
+from ..types import Camera, Float, check_rigid
+from .board import Board
+
+FILE = "calibration.json"
+SUFFIXES = ("png", "jpg", "tiff", "tif", "pgm", "raw")
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+class _BoardDoc(_Strict):
+    kind: str = "checkerboard"
+    columns: int
+    rows: int
+    spacing_m: float
+    mark_ratio: float = 0.5
+
+
+class _Lens(_Strict):
+    width_px: int
+    height_px: int
+    K: list[list[float]]
+    distortion: list[float] = []
+
+
+class _DepthDoc(_Strict):
+    unit_m: float = Field(0.001, gt=0)
+    invalid: list[int] = [0]
+    kind: Literal["metric", "disparity"] = "metric"
+    camera: _Lens | None = None
+    lens_known: bool = False
+    T_depth_color: list[list[float]] | None = None
+
+
+class _RawDoc(_Strict):
+    width_px: int = Field(gt=0)
+    height_px: int = Field(gt=0)
+    big_endian: bool = False
+    header_bytes: int = Field(0, ge=0)
+
+
+class _Config(_Strict):
+    board: _BoardDoc
+    files: dict[Literal["color", "thermal", "depth"], str] = {}
+    depth: _DepthDoc = _DepthDoc()
+    thermal_raw: _RawDoc | None = None
+    picks: str | None = None
+    free_spacing: bool = False
+    mirrored: list[Literal["color", "thermal", "depth"]] = []
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationFolder:
+    """An opened folder. files : camera -> view name -> path. Pictures are decoded when asked for."""
+
+    root: Path
+    board: Board
+    files: dict[str, dict[str, Path]]
+    picks: Path | None
+    free_spacing: bool
+    mirrored: frozenset[str]
+    depth_kind: str
+    depth_camera: Camera | None
+    depth_lens_known: bool
+    T_depth_color: Float | None
+    _config: _Config
+
+    @property
+    def names(self) -> list[str]:
+        """All view names, sorted: the order of recording."""
+        return sorted(set().union(*self.files.values()))
+
+    def color(self, name: str) -> NDArray[np.uint8]:
+        """(H, W) 8-bit grey of a colour picture."""
+        image = read_image(self.files["color"][name], kind="colour")
+        if image.dtype != np.uint8:
+            image = (image / 257).astype(np.uint8) if image.dtype == np.uint16 else image.astype(np.uint8)
+        grey = image if image.ndim == 2 else cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2GRAY)
+        return self._turned(np.asarray(grey, np.uint8), "color")
+
+    def thermal(self, name: str) -> NDArray:
+        """(H, W) counts or degC of a thermal picture."""
+        path = self.files["thermal"][name]
+        if path.suffix == ".raw":
+            return self._turned(self._raw(path), "thermal")
+        image = read_image(path, kind="thermal")
+        return self._turned(image if image.ndim == 2 else image[..., 0], "thermal")
+
+    def depth(self, name: str) -> NDArray[np.float32]:
+        """(H, W) metres, NaN none; raw disparity as float for `disparity`."""
+        path, d = self.files["depth"][name], self._config.depth
+        raw = read_image(path, kind="depth")
+        if d.kind == "disparity":
+            return self._turned(raw.astype(np.float32), "depth")
+        return self._turned(depth_from_raw(raw, d.unit_m, place=path, invalid=tuple(d.invalid)), "depth")
+
+    def _turned(self, image: NDArray, camera: str) -> NDArray:
+        return image[:, ::-1] if camera in self.mirrored else image
+
+    def _raw(self, path: Path) -> NDArray[np.uint16]:
+        r = self._config.thermal_raw
+        if r is None:
+            raise ScanError("a .raw picture needs its size", place=path, hint=f"give `thermal_raw` in {FILE}")
+        data = path.read_bytes()[r.header_bytes :]
+        if len(data) < 2 * r.width_px * r.height_px:
+            raise ScanError(f"{len(data)} bytes are too few for {r.width_px} x {r.height_px} px of 16 bit", place=path)
+        counts = np.frombuffer(data, ">u2" if r.big_endian else "<u2", r.width_px * r.height_px)
+        return counts.reshape(r.height_px, r.width_px).astype(np.uint16)
+
+
+def open_folder(
+    root: Path, *, config: Mapping[str, Any] | None = None, board: Board | None = None
+) -> CalibrationFolder:
+    """Open a calibration folder; `config` replaces its calibration.json, `board` the board in it.
+
+    Raises ScanError naming the file, the key and what was expected.
+    """
+    if not root.is_dir():
+        raise ScanError("there is no such calibration folder", place=root)
+    c = _load(root, config, board)
+    patterns = dict(c.files) or {k: f"{k}/*" for k in ("color", "thermal", "depth")}
+    files = {str(k): _matching(root, p) for k, p in patterns.items()}
+    files = {k: f for k, f in files.items() if f}
+    if not files:
+        raise ScanError(
+            "no pictures are here", place=root, hint=f"put them in color/, thermal/, depth/ or name `files` in {FILE}"
+        )
+    lens = c.depth.camera
+    try:
+        camera = lens and Camera(lens.width_px, lens.height_px, np.array(lens.K), np.array(lens.distortion))
+        T = None if c.depth.T_depth_color is None else check_rigid(c.depth.T_depth_color, "T_depth_color")
+    except ValueError as e:
+        raise ScanError(f"key 'depth': {e}", place=root / FILE) from None
+    return CalibrationFolder(
+        root=root,
+        board=board or Board(**c.board.model_dump()),
+        files=files,
+        picks=None if c.picks is None else inside(root, c.picks, place=root / FILE),
+        free_spacing=c.free_spacing,
+        mirrored=frozenset(c.mirrored),
+        depth_kind=c.depth.kind,
+        depth_camera=camera or None,
+        depth_lens_known=c.depth.lens_known and camera is not None,
+        T_depth_color=T,
+        _config=c,
+    )
+
+
+def _load(root: Path, config: Mapping[str, Any] | None, board: Board | None) -> _Config:
+    path = root / FILE
+    tree: dict[str, Any]
+    if config is not None:
+        tree = dict(config)
+    elif path.is_file():
+        try:
+            tree = json.loads(path.read_text(encoding="utf-8"))
+        except (UnicodeDecodeError, json.JSONDecodeError) as e:
+            raise ScanError(f"not valid JSON: {e}", place=path) from None
+    else:
+        tree = {}
+    if board is not None:
+        tree["board"] = {"kind": board.kind, "columns": board.columns, "rows": board.rows, "spacing_m": board.spacing_m}
+    if "board" not in tree:
+        raise ScanError(
+            "the board is not described", place=path, hint="write `board`, or give --board on the command line"
+        )
+    try:
+        return _Config.model_validate(tree)
+    except ValidationError as e:
+        fault = e.errors()[0]
+        key = ".".join(str(p) for p in fault["loc"])
+        raise ScanError(f"key '{key}': {fault['msg'][0].lower()}{fault['msg'][1:]}", place=path) from None
+
+
+def _matching(root: Path, pattern: str) -> dict[str, Path]:
+    """View name (what the star stands for) -> file."""
+    if pattern.count("*") != 1 or ".." in Path(pattern).parts or Path(pattern).is_absolute():
+        raise ScanError(f"the pattern '{pattern}' must lie in the folder and hold one star", place=root / FILE)
+    head, tail = Path(pattern).name.split("*")
+    out = {}
+    for path in sorted((root / pattern).parent.glob(Path(pattern).name)):
+        if path.is_file() and path.suffix.lstrip(".").lower() in SUFFIXES:
+            name = path.name[len(head) : len(path.name) - len(tail)]
+            out[name if tail else Path(name).stem] = path
+    return out

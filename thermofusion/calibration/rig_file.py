@@ -1,0 +1,167 @@
+"""rig.json: the `cameras` and `extrinsics` of scan.json, with how sure they are and what they rest on."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from ..errors import ScanError
+from ..rundir import write_text
+from ..types import Camera, Float, Rig, SignalCurve
+from .cameras import INTRINSIC_NAMES
+from .rig import Calibration
+
+SCHEMA = "thermofusion-rig/1"
+EXTRINSIC_ORDER = ("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m")
+
+
+class _Border(BaseModel):
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+
+
+class _CameraDoc(_Border):
+    width_px: int
+    height_px: int
+    K: list[list[float]]
+    distortion: list[float]
+
+
+class _RigDoc(_Border):
+    schema_: Literal["thermofusion-rig/1"]
+    cameras: dict[str, _CameraDoc]
+    extrinsics: dict[str, list[list[float]]]
+    covariances: dict[str, list[list[float]]] = {}
+
+
+@dataclass(frozen=True, eq=False)
+class RigFile:
+    """cameras and transforms by name; covariances (6, 6) of (rotation vector [rad], translation [m]) by transform and
+    (9, 9) of the intrinsics by camera; `document` the whole file."""
+
+    cameras: dict[str, Camera]
+    extrinsics: dict[str, Float]
+    covariances: dict[str, Float]
+    document: dict[str, Any]
+
+    def rig(self) -> Rig:
+        """As the method takes it. Raises ScanError if the calibration had no depth camera."""
+        if "depth" not in self.cameras:
+            raise ScanError("the rig was calibrated without a depth camera", hint="calibrate with depth images")
+        get = self.extrinsics.get
+        thermal = self.cameras.get("thermal") if "T_thermal_depth" in self.extrinsics else None
+        color = self.cameras.get("color") if "T_color_depth" in self.extrinsics else None
+        return Rig(self.cameras["depth"], thermal, get("T_thermal_depth"), color, get("T_color_depth"))
+
+
+def rig_document(
+    calibration: Calibration,
+    *,
+    date: str | None = None,
+    curve: SignalCurve | None = None,
+    time_offset_s: float | None = None,
+    advice: Sequence[str] = (),
+) -> dict[str, Any]:
+    """The JSON document. date : ISO 8601, the caller's. curve, time_offset_s : of the thermal camera, if known."""
+    fit = calibration.fit
+    cameras = {name: _camera_doc(c) for name, c in sorted(calibration.cameras.items())}
+    if curve is not None and "thermal" in cameras:
+        parameters = {k: list(v) if len(v) > 1 else v[0] for k, v in curve.parameters.items()}
+        cameras["thermal"]["signal"] = {"kind": curve.kind, "curve": {"type": curve.curve, **parameters}}
+    if time_offset_s is not None and "thermal" in cameras:
+        cameras["thermal"]["time_offset_s"] = time_offset_s
+    covariances = {k: v.tolist() for k, v in calibration.extrinsic_covariance.items()}
+    covariances |= {c: fit.block_covariance(c).tolist() for c in cameras}
+    return {
+        "schema": SCHEMA,
+        "date": date,
+        "cameras": cameras,
+        "extrinsics": {k: v.tolist() for k, v in calibration.extrinsics.items()},
+        "covariances": covariances,
+        "covariance_order": {"intrinsics": list(INTRINSIC_NAMES), "extrinsics": list(EXTRINSIC_ORDER)},
+        "board": {
+            "kind": calibration.data.board.kind,
+            "columns": calibration.data.board.columns,
+            "rows": calibration.data.board.rows,
+            "spacing_m": calibration.spacing_m,
+            "spacing_sigma_m": calibration.spacing_sigma_m,
+        },
+        "depth_correction": _depth_doc(calibration),
+        "figures": figures(calibration),
+        "notes": list(calibration.notes),
+        "advice": list(advice),
+    }
+
+
+def figures(calibration: Calibration) -> dict[str, Any]:
+    """The numbers a person judges a calibration by; px rms are distances."""
+    fit, problem = calibration.fit, calibration.fit.problem
+    out: dict[str, Any] = {
+        "converged": fit.converged,
+        "views": len(problem.views),
+        "alone_rms_px": {c: s.rms_px for c, s in calibration.single.items()},
+        "joint_rms_px": {c: fit.rms_px(c) for c in problem.cameras},
+        "views_rms_px": {
+            v.name: {c: fit.rms_px(c, {v.name}) for c in problem.cameras if c in v.points} for v in problem.views
+        },
+    }
+    if calibration.grouping is not None:
+        g = calibration.grouping
+        out["groups"] = [g.names(k) for k in range(g.count)]
+        out["group_reported"] = calibration.chosen_group
+        out["group_rms_px"] = [fit.rms_px("thermal", set(g.names(k))) for k in range(g.count)]
+        out["outliers_px"] = g.outliers
+    if problem.depth is not None:
+        r, _ = fit.residuals()["depth_plane"]
+        out["depth_plane_median_mm"] = float(np.median(np.abs(r * problem.depth.sigma)) * 1e3)
+    return out
+
+
+def write_rig(path: Path, document: dict[str, Any]) -> None:
+    """Write rig.json whole or not at all."""
+    write_text(path, json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+
+
+def read_rig(path: Path) -> RigFile:
+    """Read rig.json. Raises ScanError naming the key."""
+    try:
+        raw = json.loads(path.read_text(encoding="utf-8"))
+        doc = _RigDoc.model_validate({"schema_": raw.get("schema"), **raw})
+    except FileNotFoundError:
+        raise ScanError("there is no such rig file", place=path) from None
+    except (UnicodeDecodeError, json.JSONDecodeError, AttributeError) as e:
+        raise ScanError(f"not a rig file ({e})", place=path) from None
+    except ValidationError as e:
+        fault = e.errors()[0]
+        key = ".".join(str(p) for p in fault["loc"])
+        raise ScanError(f"key '{key}': {fault['msg'][0].lower()}{fault['msg'][1:]}", place=path) from None
+    try:
+        cameras = {
+            n: Camera(c.width_px, c.height_px, np.array(c.K), np.array(c.distortion)) for n, c in doc.cameras.items()
+        }
+    except ValueError as e:
+        raise ScanError(f"key 'cameras': {e}", place=path) from None
+    extrinsics = {k: np.array(v) for k, v in doc.extrinsics.items()}
+    return RigFile(cameras, extrinsics, {k: np.array(v) for k, v in doc.covariances.items()}, raw)
+
+
+def _camera_doc(c: Camera) -> dict[str, Any]:
+    return {"width_px": c.width_px, "height_px": c.height_px, "K": c.K.tolist(), "distortion": c.distortion.tolist()}
+
+
+def _depth_doc(calibration: Calibration) -> dict[str, Any] | None:
+    model = calibration.depth_model
+    if model is None:
+        return None
+    values = calibration.fit.block("depth_model")
+    sigma = np.sqrt(np.diag(calibration.fit.block_covariance("depth_model")))
+    return {
+        "model": "disparity" if type(model).__name__ == "DisparityDepth" else "metric",
+        "parameters": {n: float(v) for n, v in zip(model.names, values, strict=True)},
+        "sigma": {n: float(s) for n, s in zip(model.names, sigma, strict=True)},
+    }
