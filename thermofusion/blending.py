@@ -6,19 +6,19 @@ inverse-variance weights and a robust loss; the others are what the field does, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_matrix
 
 from .crosscal import CrosscalResult
 from .emissivity import EmissivityModel, follows_shape
 from .radiometry import ZERO_DEGC_K, Band, leaving_radiance, paper_chain
 from .recipe import RadiometrySection
-from .robustmean import RobustMean, chunks, vertex_sums
+from .robustmean import Groups, RobustMean
 from .types import Bool, Float, Float32, Int, Observations, OutputMode
 from .uncertainty import (
     AngleTables,
@@ -31,7 +31,7 @@ from .uncertainty import (
     vertex_uncertainty,
 )
 
-BLOCK = 12_000_000  # rows held in copies at once: larger scans are blended by blocks of vertices
+BLOCK = 1_500_000  # rows worked on at once by each of two threads: bounds memory whatever the scan
 MODES = 10  # of the calibration's covariance that are followed to each vertex
 FACING_DEG = 15.0  # what counts as straight on for the paper's S
 
@@ -57,14 +57,6 @@ class BlendResult:
     distance_m: Float32
     residual: Float32
     spread_K: Float32
-
-    @classmethod
-    def joined(cls, blocks: Sequence[BlendResult]) -> BlendResult:
-        """Blocks of vertices, one after the other."""
-        names = [f for f in cls.__dataclass_fields__ if f not in ("output", "uncertainty")]
-        arrays = {name: np.concatenate([getattr(b, name) for b in blocks]) for name in names}
-        uncertainty = Uncertainty.joined([b.uncertainty for b in blocks])
-        return cls(output=blocks[0].output, uncertainty=uncertainty, **arrays)
 
     @property
     def temperature_K(self) -> Float:
@@ -100,6 +92,7 @@ def blend(
     errors: ErrorModel | None = None,
     max_angle_deg: float = 65.0,
     last_resort_angle_deg: float = 75.0,
+    with_uncertainty: bool = True,
 ) -> BlendResult:
     """One temperature per vertex from all observations of it.
 
@@ -109,6 +102,7 @@ def blend(
     calibration : used by method `joint` only; its shape of ε(θ) replaces the model's.
     emissivity : the recipe's model. L_reflected : radiance reflected by vertices, scalar or (V,).
     reflected_K : temperature of the room's reflection (the paper's T_a). air_K : of the air, for the budget.
+    with_uncertainty : False for a first round whose temperatures only feed the next: no budget, NaN.
     """
     settings, errors = settings or RadiometrySection(), errors or ErrorModel()
     calibration = calibration if settings.method == "joint" else None
@@ -122,20 +116,27 @@ def blend(
         settings=settings,
         slope_L=calibration.slope_L if calibration else skin_slope(band, observations.radiance),
         paper_S=_paper_scale(observations, emissivity, band, reflected_K) if settings.method == "paper" else 1.0,
-        angles_deg=(max_angle_deg, max(last_resort_angle_deg, max_angle_deg)),
+        distance_m=float(np.median(observations.range_m)) if len(observations) else 0.0,
+        with_uncertainty=with_uncertainty,
     )
+    usable, oblique = _usable(observations, n_vertices, max_angle_deg, max(last_resort_angle_deg, max_angle_deg))
     L_r = np.broadcast_to(np.asarray(L_reflected, np.float64), (n_vertices,))
     gradient = np.broadcast_to(np.asarray(errors.gradient_K_per_m, np.float32), (n_vertices,))
-    blocks = max(1, -(-len(observations) // BLOCK))
-    edges = np.linspace(0, n_vertices, blocks + 1).astype(int)
-    results = []
-    for lo, hi in pairwise(edges):
-        rows = observations
-        if blocks > 1:
-            rows = observations.select(np.flatnonzero((rows.vertex >= lo) & (rows.vertex < hi)))
-            rows = replace(rows, vertex=rows.vertex - np.int32(lo))
-        results.append(_blend(rows, L_r[lo:hi], task, replace(errors, gradient_K_per_m=gradient[lo:hi])))
-    return results[0] if blocks == 1 else BlendResult.joined(results)
+
+    def block(edges: tuple[int, int]) -> _Block:
+        lo, hi = edges
+        mine = np.flatnonzero(usable & (observations.vertex >= lo) & (observations.vertex < hi))
+        groups, order = Groups.by_vertex(observations.vertex[mine] - np.int32(lo), hi - lo)
+        groups = replace(groups, vertex=groups.vertex + np.int32(lo))
+        rows = observations.select(mine[order])
+        local = replace(errors, gradient_K_per_m=gradient[groups.vertex])
+        return _blend(
+            replace(rows, vertex=groups.rows(np.arange(len(groups), dtype=np.int32))), groups, L_r, task, local
+        )
+
+    edges = np.linspace(0, n_vertices, max(1, -(-len(observations) // BLOCK)) + 1).astype(int).tolist()
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        return _assembled(list(pool.map(block, pairwise(edges))), oblique, n_vertices, task)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,52 +152,81 @@ class _Task:
     settings: RadiometrySection
     slope_L: float
     paper_S: float
-    angles_deg: tuple[float, float]
+    distance_m: float  # typical
+    with_uncertainty: bool
+
+    @property
+    def angle_corrected(self) -> bool:
+        return self.settings.method in ("joint", "corrected-cos")
+
+    @property
+    def epsilon0(self) -> float:
+        """1 where nothing is corrected."""
+        return self.model.normal if self.angle_corrected else 1.0
+
+    @cached_property
+    def tables(self) -> AngleTables:
+        return AngleTables.of(self.model)
 
 
-def _blend(rows: Observations, L_r: Float, task: _Task, errors: ErrorModel) -> BlendResult:
-    """`blend` of one block of vertices, numbered from 0."""
-    V, method, band = len(L_r), task.settings.method, task.band
-    usable, oblique, count = _usable(rows, V, *task.angles_deg)
-    rows = rows if usable.all() else rows.select(usable)
-    best, distance = _best(rows, V)
-    apparent = _mean(rows, rows.radiance, 1 / rows.footprint_m2, V)
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """The blend of the vertices of one block that were seen: columns (G,) by name, errors apart."""
+
+    vertex: Int
+    columns: dict[str, NDArray]
+    parts_K: dict[str, NDArray]
+    common_K: dict[str, NDArray]
+
+
+def _blend(rows: Observations, groups: Groups, L_r: Float, task: _Task, errors: ErrorModel) -> _Block:
+    """Blend rows that are grouped by vertex; their vertices are numbered by group."""
+    method, band, L_r = task.settings.method, task.band, L_r[groups.vertex]
+    best = groups.least(-rows.cos_angle)
+    resolution = 1 / rows.footprint_m2
+    apparent = groups.sums(resolution * rows.radiance) / groups.sums(resolution)
+    columns = {
+        "count": groups.count,
+        "best_angle_deg": np.degrees(np.arccos(np.clip(rows.cos_angle[best], -1, 1))),
+        "distance_m": rows.range_m[best],
+        "apparent_K": band.temperature_K(apparent),
+    }
+    parts: dict[str, NDArray] = {}
+    common: dict[str, NDArray] = {}
     if method in ("nearest-view", "paper"):
-        pick = _pick(rows, V, rows.range_m if method == "nearest-view" else -rows.cos_angle)
-        L0 = L_s = _single(rows.select(pick), V, task)
-        residual = spread = np.full(V, np.nan, np.float32)
-        uncertainty = Uncertainty.of({"noise": np.where(np.isnan(L_s), np.nan, errors.netd_K)})
+        pick = groups.least(rows.range_m) if method == "nearest-view" else best
+        L0 = L_s = _single(rows.select(pick), task)
+        parts = {"noise": np.full(len(groups), errors.netd_K)}
     else:
-        system = _robust_mean(rows, L_r, task, errors)
-        scale = task.calibration.residual_sigma if task.calibration and system.statistical else None
-        x = system.solve(robust=method == "joint", scale=scale)
-        L0, L_s = L_r + x, L_r + x / system.epsilon0
-        residual, spread = system.scatter(x)
-        uncertainty = _uncertainty(rows, system, x, band.temperature_K(L_s), distance, spread, task, errors)
-    T0, T_s, T_app = (band.temperature_K(L) for L in (L0, L_s, apparent))
-    return BlendResult(
-        task.settings.output, T_s, T0, T_app, uncertainty, count, oblique, best, distance, residual, spread
-    )
+        mean = _robust_mean(rows, groups, L_r, task, errors)
+        scale = task.calibration.residual_sigma if task.calibration and mean.statistical else None
+        x = mean.solve(robust=method == "joint", scale=scale)
+        L0, L_s = L_r + x, L_r + x / task.epsilon0
+        columns["residual"], spread = mean.scatter(x)
+        columns["spread_K"] = spread / task.slope_L
+        if task.with_uncertainty:
+            parts, common = _errors_of(rows, mean, x, band.temperature_K(L_s), columns, task, errors)
+    columns |= {"absolute_K": band.temperature_K(L_s), "normal_equivalent_K": band.temperature_K(L0)}
+    return _Block(groups.vertex, columns, parts, common)
 
 
-def _uncertainty(
+def _errors_of(
     rows: Observations,
-    system: RobustMean,
+    mean: RobustMean,
     x: Float,
     T_K: Float,
-    distance_m: Float32,
-    spread_K: Float32,
+    columns: dict[str, NDArray],
     task: _Task,
     errors: ErrorModel,
-) -> Uncertainty:
+) -> tuple[dict[str, NDArray], dict[str, NDArray]]:
     calibration = task.calibration
     fitted = calibration is not None and calibration.shape_sigma > 0
     return vertex_uncertainty(
-        _levers(rows, system, x, task, errors),
+        _levers(rows, mean, x, task, errors),
         x,
         T_K,
-        epsilon0=system.epsilon0,
-        absolute=task.settings.output == "absolute" and system.angle_corrected,
+        epsilon0=task.epsilon0,
+        absolute=task.settings.output == "absolute" and task.angle_corrected,
         slope_L=task.slope_L,
         slope_reflected=float(task.band.d_radiance_dT(task.reflected_K)),
         errors=errors,
@@ -205,8 +235,38 @@ def _uncertainty(
         reference_sigma_K=calibration.reference_sigma_K if calibration else np.nan,
         air_K=task.air_K,
         transmission_per_m=task.settings.transmission_per_m,
-        range_m=distance_m,
-        views_K=None if calibration else spread_K,
+        path_m=columns["distance_m"] - task.distance_m,
+        views_K=None if calibration else columns["spread_K"],
+    )
+
+
+def _assembled(blocks: list[_Block], oblique: Bool, n_vertices: int, task: _Task) -> BlendResult:
+    """Blocks put into arrays of all vertices: NaN, and count 0, where none was seen."""
+    vertex = np.concatenate([b.vertex for b in blocks])
+
+    def whole(pieces: list[NDArray], dtype: type) -> NDArray:
+        out: NDArray = np.full(n_vertices, 0 if dtype is np.int32 else np.nan, dtype)
+        out[vertex] = np.concatenate(pieces)
+        return out
+
+    def column(name: str, dtype: type = np.float64) -> NDArray:
+        nan = [np.full(len(b.vertex), np.nan) for b in blocks]
+        return whole([b.columns.get(name, n) for b, n in zip(blocks, nan, strict=True)], dtype)
+
+    parts = {k: whole([b.parts_K[k] for b in blocks], np.float32) for k in blocks[0].parts_K}
+    common = {k: whole([b.common_K[k] for b in blocks], np.float32) for k in blocks[0].common_K}
+    return BlendResult(
+        output=task.settings.output,
+        absolute_K=column("absolute_K"),
+        normal_equivalent_K=column("normal_equivalent_K"),
+        apparent_K=column("apparent_K"),
+        uncertainty=Uncertainty.of(parts or {"noise": np.full(n_vertices, np.nan)}, common),
+        count=column("count", np.int32),
+        oblique=oblique,
+        best_angle_deg=column("best_angle_deg", np.float32),
+        distance_m=column("distance_m", np.float32),
+        residual=column("residual", np.float32),
+        spread_K=column("spread_K", np.float32),
     )
 
 
@@ -215,61 +275,28 @@ def _uncertainty(
 
 def _usable(
     observations: Observations, n_vertices: int, max_angle_deg: float, last_resort_angle_deg: float
-) -> tuple[Bool, Bool, Int]:
-    """(rows that count, vertices that only oblique rows saw, rows per vertex)."""
-    cos = np.where(np.isfinite(observations.radiance), observations.cos_angle, -1.0)
-    good = cos >= np.float32(np.cos(np.radians(max_angle_deg)))
-    last = cos >= np.float32(np.cos(np.radians(max(last_resort_angle_deg, max_angle_deg))))
+) -> tuple[Bool, Bool]:
+    """(rows that count, vertices that only oblique rows saw)."""
+    measured = np.isfinite(observations.radiance)
+    good = measured & (observations.cos_angle >= np.float32(np.cos(np.radians(max_angle_deg))))
     well_seen = np.zeros(n_vertices, bool)
     well_seen[observations.vertex[good]] = True
-    usable = good | (last & ~well_seen[observations.vertex])
-    count = np.bincount(observations.vertex[usable], minlength=n_vertices).astype(np.int32)
-    return usable, (count > 0) & ~well_seen, count
+    last = measured & (observations.cos_angle >= np.float32(np.cos(np.radians(last_resort_angle_deg)))) & ~good
+    last &= ~well_seen[observations.vertex]
+    oblique = np.zeros(n_vertices, bool)
+    oblique[observations.vertex[last]] = True
+    return good | last, oblique
 
 
-def _part(rows: Observations, c: slice) -> Observations:
-    """Views, not copies, of some rows."""
-    return Observations(**{name: getattr(rows, name)[c] for name in rows.__dataclass_fields__})
-
-
-def _mean(rows: Observations, values: NDArray, weights: NDArray, n_vertices: int) -> Float:
-    """Weighted mean per vertex, NaN where no row is."""
-    total = vertex_sums(rows.vertex, weights, n_vertices)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        weighted = vertex_sums(rows.vertex, weights * values.astype(np.float64), n_vertices)
-        return weighted / np.where(total > 0, total, np.nan)
-
-
-def _best(rows: Observations, n_vertices: int) -> tuple[Float32, Float32]:
-    """Angle [deg] and range [m] of the straightest row of each vertex."""
-    pick = _pick(rows, n_vertices, -rows.cos_angle)
-    angle, distance = np.full(n_vertices, np.nan, np.float32), np.full(n_vertices, np.nan, np.float32)
-    angle[rows.vertex[pick]] = np.degrees(np.arccos(np.clip(rows.cos_angle[pick], -1, 1)))
-    distance[rows.vertex[pick]] = rows.range_m[pick]
-    return angle, distance
-
-
-def _pick(rows: Observations, n_vertices: int, cost: NDArray) -> NDArray[np.intp]:
-    """Row of least cost of each vertex that has one; the first row among equals."""
-    least = np.full(n_vertices, np.inf, cost.dtype)
-    np.minimum.at(least, rows.vertex, cost)
-    candidate = np.flatnonzero(cost == least[rows.vertex])
-    first = np.full(n_vertices, -1, np.intp)
-    first[rows.vertex[candidate][::-1]] = candidate[::-1]
-    return first[first >= 0]
-
-
-def _single(rows: Observations, n_vertices: int, task: _Task) -> Float:
-    """Radiance from one row a vertex: raw, or for method `paper` Eqs. 24-27 in degrees Celsius, as radiance again."""
+def _single(rows: Observations, task: _Task) -> Float:
+    """Radiance of one row a vertex: raw, or for method `paper` Eqs. 24-27 in degrees Celsius, as radiance again."""
     L = rows.radiance.astype(np.float64)
-    if task.settings.method == "paper":
-        degC, ambient = task.band.temperature_K(L) - ZERO_DEGC_K, task.reflected_K - ZERO_DEGC_K
-        epsilon = task.given(rows.cos_angle.astype(np.float64))
-        _, scaled = paper_chain(degC, epsilon, ambient, S=task.paper_S)
-        L = task.band.radiance(scaled + ZERO_DEGC_K)
-    out = np.full(n_vertices, np.nan)
-    out[rows.vertex] = L
-    return out
+    if task.settings.method == "nearest-view":
+        return L
+    degC, ambient = task.band.temperature_K(L) - ZERO_DEGC_K, task.reflected_K - ZERO_DEGC_K
+    epsilon = task.given(rows.cos_angle.astype(np.float64))
+    _, scaled = paper_chain(degC, epsilon, ambient, S=task.paper_S)
+    return task.band.radiance(scaled + ZERO_DEGC_K)
 
 
 def _paper_scale(rows: Observations, emissivity: EmissivityModel, band: Band, reflected_K: float) -> float:
@@ -286,59 +313,32 @@ def _paper_scale(rows: Observations, emissivity: EmissivityModel, band: Band, re
 # ---------------------------------------------------------------- weighted means
 
 
-def _robust_mean(
-    rows: Observations,
-    L_r: Float,
-    task: _Task,
-    errors: ErrorModel,
-) -> RobustMean:
+def _robust_mean(rows: Observations, groups: Groups, L_r: Float, task: _Task, errors: ErrorModel) -> RobustMean:
     """Rows y = E·x with the method's weights."""
-    method, calibration = task.settings.method, task.calibration
-    corrected = method in ("joint", "corrected-cos")
+    y = (task.calibration.corrected(rows) if task.calibration else rows.radiance) - groups.rows(L_r)
+    E = task.tables.relative(rows.cos_angle) if task.angle_corrected else np.ones(len(rows))
+    method = task.settings.method
     statistical = method == "joint" and task.settings.weight == "inverse-variance"
-    tables = AngleTables.of(task.model)
-    n, n_vertices = len(rows), len(L_r)
-    y, E, weight = np.empty(n), np.empty(n), np.ones(n, np.float32)
-    for c in chunks(n):
-        part = _part(rows, c)
-        y[c] = (calibration.corrected(part) if calibration else part.radiance) - L_r[part.vertex]
-        E[c] = tables.relative(part.cos_angle) if corrected else 1.0
-    excess = _mean(rows, y, weight, n_vertices) if statistical else L_r
-    for c in chunks(n if method != "mean" else 0):
-        part = _part(rows, c)
-        if statistical:
-            weight[c] = 1 / observation_variance(part, excess[part.vertex], tables, errors, task.slope_L)
-        else:  # resolution: pixels per surface, proportional to cosθ/d²
-            weight[c] = 1e-6 / part.footprint_m2
-    epsilon0 = task.model.normal if corrected else 1.0
-    return RobustMean(
-        rows.vertex, y, E, weight, weight.copy(), n_vertices, corrected, statistical, epsilon0, task.slope_L
-    )
+    if statistical:
+        excess = groups.rows((groups.sums(y) / groups.count).astype(np.float32))
+        weight = np.float32(1) / observation_variance(rows, excess, task.tables, errors, task.slope_L)
+    elif method == "mean":
+        weight = np.ones(len(rows), np.float32)
+    else:  # resolution: pixels per surface, proportional to cosθ/d²
+        weight = np.float32(1e-6) / rows.footprint_m2
+    weight = np.asarray(weight, np.float32)
+    return RobustMean(groups, np.asarray(y), E, weight, weight.copy(), statistical)
 
 
-def _levers(rows: Observations, system: RobustMean, x: Float, task: _Task, errors: ErrorModel) -> Levers:
+def _levers(rows: Observations, mean: RobustMean, x: Float, task: _Task, errors: ErrorModel) -> Levers:
     """Σ over each vertex's rows of h times what an error does to a row, h = wE/ΣwE²."""
-    V, R = system.n_vertices, MODES if task.calibration else 0
-    a = system.denominator(system.robust)
-    inverse = np.divide(1.0, a, out=np.zeros(V), where=a > 0)
-    tables = AngleTables.of(task.model)
-    sums, squares = np.zeros((V, 4 + R)), np.zeros((V, 2))
-    effect = task.calibration.error_modes(MODES) if task.calibration else None
-    for c in chunks(len(rows)):
-        part = _part(rows, c)
-        h = (system.robust[c] * system.E[c] * inverse[part.vertex]).astype(np.float32)
-        slope = tables.slope(part.cos_angle) if system.angle_corrected else np.zeros(len(h), np.float32)
-        columns = [
-            np.ones(len(h), np.float32),
-            (1 - system.E[c]).astype(np.float32),
-            slope,
-            registration_m(part, errors),
-        ]
-        block = np.stack(columns, axis=1)
-        if effect is not None:
-            block = np.concatenate([block, effect(part, x[part.vertex])], axis=1)
-        n = np.arange(len(h) + 1)
-        sums += csc_matrix((h, part.vertex, n), shape=(V, len(h))) @ block
-        block = np.stack([np.ones(len(h), np.float32), slope**2], axis=1)
-        squares += csc_matrix((h * h, part.vertex, n), shape=(V, len(h))) @ block
-    return Levers(squares[:, 0], sums[:, 0], sums[:, 1], sums[:, 2], squares[:, 1], sums[:, 3], sums[:, 4:])
+    groups, one = mean.groups, np.ones(len(rows), np.float32)
+    h = (mean.robust * mean.E / groups.rows(mean.denominator(mean.robust))).astype(np.float32)
+    slope = task.tables.slope(rows.cos_angle) if task.angle_corrected else 0 * one
+    block = np.stack([one, (1 - mean.E).astype(np.float32), slope, registration_m(rows, errors)], axis=1)
+    sums = groups.weighted_sums(h, block)
+    squares = groups.weighted_sums(h * h, np.stack([one, slope * slope], axis=1))
+    modes = np.zeros((len(groups), 0))
+    if task.calibration:
+        modes = groups.weighted_sums(h, task.calibration.error_modes(MODES)(rows, groups.rows(x.astype(np.float32))))
+    return Levers(squares[:, 0], sums[:, 0], sums[:, 1], sums[:, 2], squares[:, 1], sums[:, 3], modes)

@@ -186,7 +186,7 @@ def _system(
     numbers, vertex = np.unique(rows.vertex, return_inverse=True)
     order = np.argsort(vertex, kind="stable").astype(np.int32)
     count = np.bincount(vertex)
-    L, cos = rows.radiance.astype(np.float64), rows.cos_angle.astype(np.float64)
+    L, cos, tables = rows.radiance.astype(np.float64), rows.cos_angle, AngleTables.of(emissivity)
     y = L - L_r[rows.vertex]
     # weights must not depend on the camera's common offset: what references say of it is taken off first
     contact_rows = _contact_rows(contacts, numbers, L_r, emissivity.normal)
@@ -205,9 +205,9 @@ def _system(
         vertex=vertex.astype(np.int32),
         group=rows.view if settings.offsets else np.zeros(len(rows), np.int32),
         y=y,
-        E=emissivity.relative(cos),
-        D=shape_direction(cos),
-        sigma2=observation_variance(rows, excess, AngleTables.of(emissivity), errors, slope_L).astype(np.float64),
+        E=tables.relative(cos),
+        D=AngleTable.of(shape_direction(AngleTable.knots()), np.float64)(cos),
+        sigma2=observation_variance(rows, excess, tables, errors, slope_L).astype(np.float64),
         columns=columns,
         order=order,
         start=np.insert(np.cumsum(count), 0, 0).astype(np.int32),

@@ -78,4 +78,7 @@ def _monomials(u_px: NDArray, v_px: NDArray, width_px: int, height_px: int, expo
     for _ in range(int(exponents.max(initial=0))):
         powers_x.append(powers_x[-1] * x)
         powers_y.append(powers_y[-1] * y)
-    return np.stack([powers_x[i] * powers_y[j] for i, j in exponents], axis=1)
+    out = np.empty((len(x), len(exponents)))
+    for k, (i, j) in enumerate(exponents):
+        np.multiply(powers_x[i], powers_y[j], out=out[:, k])
+    return out

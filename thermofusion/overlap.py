@@ -65,8 +65,9 @@ class ContactRow:
 class OverlapSystem:
     """Rows y = (E + s·D)·x[vertex] + b[group] + φ + γ·(L_r - pivot), with variances; vertices numbered without gaps.
 
-    x holds the camera's gain 1 + γ. columns : (N, K + 2): field patterns, D·x of the last step, L_r - pivot. group : (N,) the offset's index.
-    keep : (K_all, K) combinations of the field's patterns that are solved for. order, start : rows by vertex.
+    x holds the camera's gain 1 + γ. columns : (N, K + 2): field patterns, D·x of the last step, L_r - pivot.
+    group : (N,) the offset's index. keep : (K_all, K) combinations of the field's patterns that are solved for.
+    order, start : rows by vertex.
     """
 
     vertex: Int
@@ -114,7 +115,7 @@ class OverlapSystem:
         """Iteratively reweighted least squares: Huber to a first estimate, weighted medians per vertex, then Tukey."""
         M, K, P = self.sizes
         p = np.zeros(P)
-        x = self._medians(p)
+        x = np.bincount(self.vertex, self.y) / np.diff(self.start)
         weight, scale = self._robust(p, x, huber=True)
         converged, n = False, 0
         while not converged and n < HUBER_STEPS + TUKEY_STEPS:

@@ -6,7 +6,6 @@ that the camera reports, so that 1/Σσ² is the observation's statistical weigh
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -131,16 +130,6 @@ class Uncertainty:
         total = np.sqrt(np.sum([p.astype(np.float64) ** 2 for p in parts.values()], axis=0))
         return cls(total.astype(np.float32), parts, {k: abs(v) for k, v in level.items()}, common)
 
-    @classmethod
-    def joined(cls, blocks: Sequence[Uncertainty]) -> Uncertainty:
-        """Blocks of vertices, one after the other."""
-
-        def join(pieces: Sequence[dict[str, Float32]], names: Iterable[str]) -> dict[str, NDArray]:
-            return {k: np.concatenate([p[k] for p in pieces]) for k in names}
-
-        own = [k for k in blocks[0].parts_K if k not in blocks[0].common_K]
-        return cls.of(join([b.parts_K for b in blocks], own), join([b.common_K for b in blocks], blocks[0].common_K))
-
     @property
     def level_K(self) -> float:
         """One sigma of the common level."""
@@ -179,12 +168,13 @@ def vertex_uncertainty(
     reference_sigma_K: float,
     air_K: float | None,
     transmission_per_m: float,
-    range_m: NDArray,
+    path_m: NDArray,
     views_K: NDArray | None,
-) -> Uncertainty:
-    """One sigma of each vertex with its parts, K (docs/radiometry.md, error budget).
+) -> tuple[dict[str, NDArray], dict[str, NDArray]]:
+    """Errors of each vertex, K: (parts, signed effects of what is common), for `Uncertainty.of`.
 
-    x : (V,) normal-equivalent excess. absolute : the output is divided by ε(0), else normal-equivalent.
+    x : (V,) normal-equivalent excess. absolute : the output is divided by ε(0), else normal-equivalent. path_m : (V,)
+    distance beyond the typical one. The budget is that of docs/radiometry.md.
     """
     scale = 1 / (slope_L * (epsilon0 if absolute else 1.0))  # radiance of x -> K of the output
     zero = np.zeros(len(x))
@@ -198,14 +188,13 @@ def vertex_uncertainty(
     # The level comes from a reference (or is relative), so only the path's differences count; a corrected path is taken
     # to be right to a third of itself.
     air_loss = AIR_LOSS_PER_M if transmission_per_m == 1 else (1 - transmission_per_m) / 3
-    path = np.abs(range_m - np.nanmedian(range_m)) if np.isfinite(range_m).any() else zero
     parts = {
         "noise": scale * errors.netd_K * slope_L * np.sqrt(BILINEAR_VARIANCE * levers.squared),
         "calibration": scale * np.sqrt((levers.modes**2).sum(1)),
         "shape": zero if shape_fitted else scale * np.abs(x * levers.loss) * errors.sigma_shape,
         "normals": scale * np.abs(x) * tilt * normal,
         "registration": np.asarray(errors.gradient_K_per_m) * levers.registration_m,
-        "air": zero if air_K is None else np.abs(T_K - air_K) * air_loss * path,
+        "air": zero if air_K is None else np.abs(T_K - air_K) * air_loss * np.abs(path_m),
     }
     if views_K is not None:
         parts["views"] = np.nan_to_num(views_K)
@@ -214,9 +203,7 @@ def vertex_uncertainty(
         "emissivity0": scale * x / epsilon0 * sigma_epsilon0 if absolute else zero,
         "reflected": reflected * errors.sigma_reflected_K * slope_reflected / slope_L,
     }
-    unmeasured = ~np.isfinite(T_K)
-    masked = ({k: np.where(unmeasured, np.nan, v) for k, v in group.items()} for group in (parts, common))
-    return Uncertainty.of(*masked)
+    return parts, common
 
 
 def covariance_modes(covariance: Float, count: int) -> Float:
