@@ -6,7 +6,13 @@ verbs, so that `--help` answers at once.
 
 from __future__ import annotations
 
+import os
 import sys
+
+# Our matrices are many and small, and stages bring their own threads: BLAS threads would only wait for each other
+# (twice the CPU time on two cores), and sums would depend on their number. Must be set before NumPy is loaded.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("MKL_NUM_THREADS", "1")
 
 import typer
 

@@ -77,9 +77,7 @@ def demo(
     with progress(json) as step:
         result = pipeline.fuse(scan, load_recipe("torso"), out=out, progress=step)
     emit(result.report, pipeline.summary(result, out), json)
-    note(
-        f"look at {out / 'views' / 'overview.png'}, or open {out / 'mesh.glb'} in Blender, {out / 'mesh.ply'} in MeshLab"
-    )
+    note(f"look at {out / 'views' / 'overview.png'}; open {out / 'mesh.glb'} in Blender, {out / 'mesh.ply'} in MeshLab")
     return QualityError.exit_code if result.report["quality"]["failed"] else 0
 
 
