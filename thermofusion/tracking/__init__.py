@@ -1,6 +1,6 @@
 """Where the depth camera was: odometry, fragments, loops, one joint solution, frames against the model.
 
-1. Frame to frame, point to plane on half-resolution depth, subject only; colour helps where shape says too little.
+1. Frame to frame, point to plane on coarse depth, subject only; texture helps where the shape alone could slide.
    Every step is judged; one that fails begins a new segment.
 2. Every few frames become a fragment: their depth averaged in the middle frame's view.
 3. Segments that lost each other are joined again, by time, place or shape; what cannot be joined is left out, and said.
@@ -22,8 +22,10 @@ from ..geometry import interpolate_trajectory, invert
 from ..recipe import Recipe
 from ..types import Bool, Float, Scan, Trajectory
 from .fragments import Fragment
-from .odometry import GrowingSegment, HalfFrames, Segment, odometry
-from .registration import overlapping, register, solve_jointly
+from .frames import TrackingFrames
+from .joint import overlapping, solve_jointly
+from .odometry import GrowingSegment, Segment, odometry
+from .registration import register
 from .relocalise import find_join
 
 REACHES_M = (0.08, 0.03, 0.015)  # of partners, round by round
@@ -84,7 +86,7 @@ def track(scan: Scan, recipe: Recipe, *, progress: Progress | None = None) -> Tr
 
     Raises ScanError if no frame shows the subject.
     """
-    frames = HalfFrames(scan, recipe)
+    frames = TrackingFrames(scan, recipe)
     indices = np.flatnonzero(scan.depth.usable)
 
     def step(done: int, total: int) -> None:
@@ -123,7 +125,7 @@ class _Placed:
 
 
 def _from_recorded(
-    scan: Scan, trajectory: Trajectory, frames: HalfFrames, indices: NDArray[np.intp], recipe: Recipe
+    scan: Scan, trajectory: Trajectory, frames: TrackingFrames, indices: NDArray[np.intp], recipe: Recipe
 ) -> list[Segment]:
     """One segment with the recorded poses."""
     T, valid = interpolate_trajectory(trajectory, scan.depth.times_s, max_gap_s=recipe.input.max_pose_gap_ms / 1e3)
@@ -229,7 +231,7 @@ def _refined(placed: list[_Placed]) -> list[Float]:
 
 def _result(
     scan: Scan,
-    frames: HalfFrames,
+    frames: TrackingFrames,
     indices: NDArray[np.intp],
     placed: list[_Placed],
     lost: list[LostRange],
@@ -247,6 +249,8 @@ def _result(
     if scan.trajectory is None:
         T = invert(T[int(np.argmax(tracked))]) @ T
     messages = [] if message is None else [message]
+    if frames.slides and not frames.uses_color:
+        messages.append("the shape alone leaves some motion free (a cylinder, a sphere); no colour helped to hold it")
     out = [r for r in lost if r.outcome == "left out"]
     if out:
         count, ranges = sum(r.stop - r.start for r in out), ", ".join(f"{r.start}-{r.stop - 1}" for r in out)
@@ -269,7 +273,7 @@ def _result(
     )
 
 
-def _floor(frames: HalfFrames, T: Float, tracked: Bool, n: int) -> Float | None:
+def _floor(frames: TrackingFrames, T: Float, tracked: Bool, n: int) -> Float | None:
     """The floor in the world: the median of what the frames saw, if enough saw one and they agree."""
     seen = [(i, f) for i, f in sorted(frames.subject.floors.items()) if tracked[i]]
     if len(seen) < max(3, MIN_FLOOR_SHARE * n):

@@ -8,30 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry import invert, transform_points
+from ..geometry import invert
 from ..types import Float, Float32
-from .registration import DepthMap
+from .frames import Frame
+from .maps import DepthMap, Intrinsics
 
 SAMPLES = 4000
-MIN_VALID_SHARE = 0.01  # a frame with fewer valid pixels shows nothing
 SAME_SURFACE_M = 0.02  # depth this far behind the nearest is another surface
 MIN_SHARE = 1 / 3  # of the frames that must see a pixel
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """A depth frame as tracking uses it: half resolution, subject only.
-
-    depth_m : (H, W) float32, NaN = none.
-    """
-
-    index: int
-    time_s: float
-    depth_m: Float32
-
-    @property
-    def empty(self) -> bool:
-        return bool(np.isfinite(self.depth_m).mean() < MIN_VALID_SHARE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +27,7 @@ class Fragment:
     map: DepthMap
 
 
-def build_fragment(frames: Sequence[Frame], T: Float, intrinsics: tuple[float, float, float, float]) -> Fragment:
+def build_fragment(frames: Sequence[Frame], T: Float, intrinsics: Intrinsics) -> Fragment:
     """Average the frames' depth in the view of the middle one.
 
     T : (N, 4, 4) poses in any common frame. Every frame's points are projected into the middle view; what lies behind
@@ -53,23 +37,25 @@ def build_fragment(frames: Sequence[Frame], T: Float, intrinsics: tuple[float, f
     T_middle_frame = invert(T[middle]) @ T
     fx, fy, cx, cy = intrinsics
     h, w = frames[0].depth_m.shape
-    x = np.broadcast_to(((np.arange(w) - cx) / fx).astype(np.float32), (h, w))
-    y = np.broadcast_to(((np.arange(h) - cy) / fy).astype(np.float32)[:, None], (h, w))
+    x = ((np.arange(w) - cx) / fx).astype(np.float32)[None]
+    y = ((np.arange(h) - cy) / fy).astype(np.float32)[:, None]
     pixels, depths = [], []
     for frame, pose in zip(frames, T_middle_frame, strict=True):
-        ok = np.isfinite(frame.depth_m)
-        z = frame.depth_m[ok]
-        p = transform_points(pose, np.stack([x[ok] * z, y[ok] * z, z], axis=1))
+        R, t = pose[:3, :3].astype(np.float32), pose[:3, 3].astype(np.float32)
+        px, py, pz = (frame.depth_m * (R[k, 0] * x + R[k, 1] * y + R[k, 2]) + t[k] for k in range(3))
         with np.errstate(divide="ignore", invalid="ignore"):
-            u, v = np.rint(p[:, 0] / p[:, 2] * fx + cx), np.rint(p[:, 1] / p[:, 2] * fy + cy)
-        inside = (p[:, 2] > 0.1) & (u >= 0) & (v >= 0) & (u < w) & (v < h)
+            u, v = (
+                np.rint(px / pz * np.float32(fx) + np.float32(cx)),
+                np.rint(py / pz * np.float32(fy) + np.float32(cy)),
+            )
+            inside = (pz > 0.1) & (u >= 0) & (v >= 0) & (u < w) & (v < h)
         pixels.append(v[inside].astype(np.intp) * w + u[inside].astype(np.intp))
-        depths.append(p[inside, 2])
-    depth = _average(np.concatenate(pixels), np.concatenate(depths), h * w, len(frames))
+        depths.append(pz[inside])
+    depth = _average(np.concatenate(pixels), np.concatenate(depths), h * w, len(frames)).reshape(h, w)
+    texture = frames[middle].map.texture
+    intensity = None if texture is None else texture[:, 0].reshape(h, w)
     return Fragment(
-        np.array([f.index for f in frames]),
-        T_middle_frame,
-        DepthMap.of(depth.reshape(h, w), intrinsics, SAMPLES),
+        np.array([f.index for f in frames]), T_middle_frame, DepthMap.of(depth, intrinsics, SAMPLES, intensity)
     )
 
 

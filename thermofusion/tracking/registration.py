@@ -1,105 +1,63 @@
-"""Point to plane between depth images: projective partners, robust weights, one joint solution for many views.
+"""Point to plane between depth images: projective partners, robust weights, colour as help where there is any.
 
 A point of view i finds its partner in view j by projection, not by search: a few thousand points cost a millisecond.
-Residuals are distances along the partner's normal, weighted by depth noise (∝ z²) and a robust kernel. Deterministic:
-plain sums in a fixed order.
+Residuals are distances along the partner's normal, weighted by depth noise (∝ z²) and a robust kernel; with texture
+also differences of intensity. Deterministic: plain sums in a fixed order.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..geometry import invert, se3_exp
-from ..types import Float, Float32
+from ..types import Float
+from .maps import DepthMap
 
-NORMAL_STEP_PX = 2  # normals from differences over twice this: wide enough to average noise
-NORMAL_JUMP = 0.06  # of the range: a normal across a depth step is none
 MAX_NORMAL_DEG = 45.0  # partners must face alike
 MIN_PARTNERS = 150
 NOISE_FLOOR_M = 3e-4
+INTENSITY_FLOOR = 0.05  # of the normalised intensity, whose local spread is about 1
 
 
 @dataclass(frozen=True, eq=False)
-class DepthMap:
-    """A depth image as points and normals, ready to be a partner.
+class Rows:
+    """Linear equations direction·(motion of point) = -residual. points, directions : (N, 3); residual : (N,)."""
 
-    fx, fy, cx, cy : of the image. shape : (H, W). points, normals : (H*W, 3) float32, NaN = none. sample, and
-    sample_normals : (N, 3) float64, an even sample that is sent to other views.
-    """
-
-    intrinsics: tuple[float, float, float, float]
-    shape: tuple[int, int]
-    points: Float32
-    normals: Float32
-    sample: Float
-    sample_normals: Float
-
-    @classmethod
-    def of(cls, depth_m: Float32, intrinsics: tuple[float, float, float, float], samples: int) -> DepthMap:
-        """From a depth image (H, W), metres, NaN = none."""
-        fx, fy, cx, cy = intrinsics
-        h, w = depth_m.shape
-        x = ((np.arange(w) - cx) / fx).astype(np.float32)
-        y = ((np.arange(h) - cy) / fy).astype(np.float32)
-        points = np.stack([x[None] * depth_m, y[:, None] * depth_m, depth_m], axis=-1)
-        normals = _normals(points).reshape(-1, 3)
-        points = points.reshape(-1, 3)
-        good = np.flatnonzero(np.isfinite(normals[:, 0]))
-        # an even sample in image order: same input, same sample
-        pick = good[np.linspace(0, len(good) - 1, min(samples, len(good))).astype(np.intp)] if len(good) else good
-        return cls(
-            intrinsics, (h, w), points, normals, points[pick].astype(np.float64), normals[pick].astype(np.float64)
-        )
-
-    def sample_only(self) -> DepthMap:
-        """Without the image: what is left can be sent to other views, and takes little memory."""
-        nothing = np.empty((0, 3), np.float32)
-        return replace(self, points=nothing, normals=nothing)
-
-
-def _normals(points: Float32) -> Float32:
-    """Unit normals (H, W, 3) towards the camera, NaN at depth steps and holes."""
-    s = NORMAL_STEP_PX
-    du, dv = np.full_like(points, np.nan), np.full_like(points, np.nan)
-    du[:, s:-s] = points[:, 2 * s :] - points[:, : -2 * s]
-    dv[s:-s] = points[2 * s :] - points[: -2 * s]
-    n = np.cross(dv, du)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        n /= np.sqrt(np.einsum("ijk,ijk->ij", n, n))[..., None]
-        limit = np.float32(NORMAL_JUMP) * points[..., 2]
-        n[~((np.abs(du[..., 2]) < limit) & (np.abs(dv[..., 2]) < limit))] = np.nan
-    return n
+    points: Float
+    directions: Float
+    residual: Float
 
 
 @dataclass(frozen=True, eq=False)
 class Partners:
     """Points of one view with their partners in another, in the other's frame.
 
-    points : (N, 3). normals : (N, 3) of the partners. residual_m : (N,) distance along them. share : of the points
-    that project into the other image, how many found a partner; sent : points sent.
+    shape : distance along the partner's normal, m. color : difference of intensity along the image slope, or None.
+    share : of the points that project into the other image, how many found a partner. sent : points sent.
     """
 
-    points: Float
-    normals: Float
-    residual_m: Float
+    shape: Rows
+    color: Rows | None
     share: float
     sent: int
+
+    def __len__(self) -> int:
+        return len(self.shape.residual)
 
     @property
     def fitness(self) -> float:
         """Share of all points sent that found a partner."""
-        return len(self.residual_m) / max(self.sent, 1)
+        return len(self) / max(self.sent, 1)
 
     @property
     def residual_mm_at_1m(self) -> float:
         """Median distance, mm, with the growth of depth noise (z²) taken out."""
-        if not len(self.residual_m):
+        if not len(self):
             return float("nan")
-        return float(np.median(np.abs(self.residual_m) / np.maximum(self.points[:, 2], 0.5) ** 2) * 1e3)
+        return float(np.median(np.abs(self.shape.residual) / np.maximum(self.shape.points[:, 2], 0.5) ** 2) * 1e3)
 
 
 def find_partners(
@@ -111,34 +69,67 @@ def find_partners(
     fx, fy, cx, cy = target.intrinsics
     h, w = target.shape
     z = np.maximum(p[:, 2], 1e-3)
-    u, v = np.rint(p[:, 0] / z * fx + cx), np.rint(p[:, 1] / z * fy + cy)
-    inside = np.flatnonzero((p[:, 2] > 0.1) & (u >= 0) & (v >= 0) & (u < w) & (v < h))
-    pixel = v[inside].astype(np.intp) * w + u[inside].astype(np.intp)
-    p, n = p[inside], target.normals[pixel].astype(np.float64)
-    d = p - target.points[pixel]
+    u, v = p[:, 0] / z * fx + cx, p[:, 1] / z * fy + cy
+    column, row = np.rint(u), np.rint(v)
+    inside = np.flatnonzero((p[:, 2] > 0.1) & (column >= 0) & (row >= 0) & (column < w) & (row < h))
+    pixel = row[inside].astype(np.intp) * w + column[inside].astype(np.intp)
+    there = target.surface[pixel].astype(np.float64)
+    n, d = there[:, 3:], p[inside] - there[:, :3]
     r = np.einsum("ij,ij->i", d, n)
     facing = np.einsum("ij,ij->i", source.sample_normals[::stride][inside] @ R.T, n)
     with np.errstate(invalid="ignore"):
         good = (np.abs(r) < reach_m) & (np.einsum("ij,ij->i", d, d) < (3 * reach_m) ** 2)
         good &= facing > np.cos(np.radians(MAX_NORMAL_DEG))
-    return Partners(p[good], n[good], r[good], float(good.mean()) if len(good) else 0.0, len(source.sample[::stride]))
+    chosen = inside[good]
+    color = None
+    if target.texture is not None and source.sample_intensity is not None:
+        off = np.stack([u - column, v - row], axis=1)[chosen]
+        texture = target.texture[pixel[good]].astype(np.float64)
+        color = _color_rows(p[chosen], source.sample_intensity[::stride][chosen], texture, off, fx, fy)
+    share = float(good.mean()) if len(good) else 0.0
+    return Partners(Rows(p[chosen], n[good], r[good]), color, share, len(source.sample[::stride]))
 
 
-def weights(partners: Partners) -> Float:
-    """Weight of each residual: 1/z⁴ for depth noise, times a Geman-McClure factor at twice the residuals' spread."""
-    r = partners.residual_m / partners.points[:, 2] ** 2
-    sigma = max(1.4826 * float(np.median(np.abs(r))), NOISE_FLOOR_M)
-    return np.asarray(1 / ((1 + (r / (2 * sigma)) ** 2) ** 2 * (partners.points[:, 2] ** 4 * sigma**2)))
+def _color_rows(p: Float, intensity: Float, texture: Float, off_px: Float, fx: float, fy: float) -> Rows:
+    """Intensity of the target at the projected point (first order from the pixel centre) minus the source's own."""
+    residual = texture[:, 0] + np.einsum("ij,ij->i", texture[:, 1:], off_px) - intensity
+    good = np.isfinite(residual)
+    p, z, gu, gv = p[good], p[good, 2], fx * texture[good, 1], fy * texture[good, 2]
+    direction = np.stack([gu / z, gv / z, -(gu * p[:, 0] + gv * p[:, 1]) / z**2], axis=1)
+    return Rows(p, direction, residual[good])
+
+
+def shape_weights(rows: Rows) -> Float:
+    """Weight of each distance: 1/z⁴ for depth noise, times a Geman-McClure factor at twice the residuals' spread."""
+    noise = rows.points[:, 2] ** 2
+    return _robust(rows.residual / noise, NOISE_FLOOR_M) / noise**2
+
+
+def _robust(r: Float, floor: float) -> Float:
+    """1/σ² times the Geman-McClure factor, σ from the residuals' own median."""
+    sigma = max(1.4826 * float(np.median(np.abs(r))), floor)
+    return np.asarray(1 / ((1 + (r / (2 * sigma)) ** 2) ** 2 * sigma**2))
 
 
 def normal_equations(partners: Partners, T_world_target: Float) -> tuple[Float, Float]:
     """(6, 6) H and (6,) g of Σ w r² for a left twist (rotation, translation) of the source in the world."""
-    w = weights(partners)
+    H, g = _accumulate(partners.shape, shape_weights(partners.shape), T_world_target)
+    if partners.color is not None and len(partners.color.residual) >= MIN_PARTNERS:
+        h, b = _accumulate(partners.color, _robust(partners.color.residual, INTENSITY_FLOOR), T_world_target)
+        H, g = H + h, g + b
+    return H, g
+
+
+def _accumulate(rows: Rows, w: Float, T_world_target: Float) -> tuple[Float, Float]:
     R = T_world_target[:3, :3]
-    x, n = partners.points @ R.T + T_world_target[:3, 3], partners.normals @ R.T
-    J = np.concatenate([np.cross(x, n), n], axis=1)
+    x, n = rows.points @ R.T + T_world_target[:3, 3], rows.directions @ R.T
+    J = np.empty((len(x), 6))
+    J[:, 0] = x[:, 1] * n[:, 2] - x[:, 2] * n[:, 1]
+    J[:, 1] = x[:, 2] * n[:, 0] - x[:, 0] * n[:, 2]
+    J[:, 2] = x[:, 0] * n[:, 1] - x[:, 1] * n[:, 0]
+    J[:, 3:] = n
     Jw = J * w[:, None]
-    return Jw.T @ J, Jw.T @ partners.residual_m
+    return Jw.T @ J, Jw.T @ rows.residual
 
 
 def register(
@@ -148,10 +139,12 @@ def register(
     reaches_m: Sequence[float],
     *,
     stride: int = 1,
+    tolerance: float = 1e-6,
 ) -> tuple[Float, Partners | None]:
     """Gauss-Newton of one view against fixed others: (T_world_source, partners in the best target at the end).
 
-    reaches_m : one iteration each, from far to near. None for the partners if no target has enough.
+    reaches_m : one iteration each, from far to near; ends early when a step at the last reach is below `tolerance`
+    rad and m. None for the partners if no target has enough.
     """
     T = T_world_source
     last: Partners | None = None
@@ -159,7 +152,7 @@ def register(
         H, g, last = np.zeros((6, 6)), np.zeros(6), None
         for target, T_world_target in targets:
             partners = find_partners(source, target, invert(T_world_target) @ T, reach, stride)
-            if len(partners.residual_m) < MIN_PARTNERS // stride:
+            if len(partners) < MIN_PARTNERS // stride:
                 continue
             h, b = normal_equations(partners, T_world_target)
             H, g = H + h, g + b
@@ -167,91 +160,8 @@ def register(
                 last = partners
         if last is None:
             return T, None
-        step = np.linalg.lstsq(H + 1e-9 * np.trace(H) * np.eye(6), -g, rcond=None)[0]
+        step = np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(6), -g)
         T = se3_exp(step) @ T
-        if np.abs(step).max() < 1e-6:
+        if reach == reaches_m[-1] and np.abs(step).max() < tolerance:
             break
     return T, last
-
-
-def solve_jointly(
-    maps: Sequence[DepthMap],
-    poses: Float,
-    edges: Sequence[tuple[int, int]],
-    reach_m: float,
-    *,
-    fixed: int = 0,
-    max_iterations: int = 8,
-    tolerance: float = 1e-4,
-) -> tuple[Float, float, bool]:
-    """All poses (F, 4, 4) T_world_map at once, from point-to-plane residuals over all edges (source, target).
-
-    The pose graph with its residuals kept instead of summarised: partners are found anew in every step. Pose `fixed`
-    stays. Returns (poses, weighted rms in m, converged: last step below `tolerance` rad and m).
-    """
-    T, n, rms = poses.copy(), len(poses), float("nan")
-    for _ in range(max_iterations):
-        A, b, total, weight = np.zeros((6 * n, 6 * n)), np.zeros(6 * n), 0.0, 0.0
-        for i, j in edges:
-            partners = find_partners(maps[i], maps[j], invert(T[j]) @ T[i], reach_m)
-            if len(partners.residual_m) < MIN_PARTNERS:
-                continue
-            h, g = normal_equations(partners, T[j])
-            si, sj = slice(6 * i, 6 * i + 6), slice(6 * j, 6 * j + 6)
-            A[si, si] += h
-            A[sj, sj] += h
-            A[si, sj] -= h
-            A[sj, si] -= h
-            b[si] -= g
-            b[sj] += g
-            w = weights(partners)
-            total, weight = total + float(w @ partners.residual_m**2), weight + float(w.sum())
-        free = np.delete(np.arange(6 * n), np.arange(6 * fixed, 6 * fixed + 6))
-        H = A[np.ix_(free, free)]
-        H[np.diag_indices_from(H)] += 1e-9 * max(float(H.trace()) / len(H), 1e-12) + 1e-6
-        x = np.zeros(6 * n)
-        x[free] = np.linalg.solve(H, b[free])
-        T = se3_exp(x.reshape(n, 6)) @ T
-        rms = float(np.sqrt(total / weight)) if weight else float("nan")
-        if np.abs(x).max() < tolerance:
-            return T, rms, True
-    return T, rms, False
-
-
-def overlapping(
-    maps: Sequence[DepthMap],
-    poses: Float,
-    reach_m: float,
-    *,
-    per_map: int,
-    min_share: float,
-    max_turn_deg: float = 75.0,
-) -> list[tuple[int, int]]:
-    """Pairs (source, target) of maps that see the same surface: neighbours in the list, and the best others.
-
-    Each map keeps its `per_map` largest overlaps of at least `min_share` of its points.
-    """
-    axis = poses[:, :3, 2]
-    near = axis @ axis.T > np.cos(np.radians(max_turn_deg))
-    pairs: set[tuple[int, int]] = set()
-    for i in range(len(maps)):
-        found: list[tuple[float, int]] = []
-        for j in np.flatnonzero(near[i]):
-            if j == i:
-                continue
-            partners = find_partners(maps[i], maps[int(j)], invert(poses[j]) @ poses[i], reach_m, 8)
-            if partners.fitness >= min_share:
-                found.append((-partners.fitness, int(j)))
-        found.sort()
-        chosen = {j for _, j in _spread(found, per_map)} | {j for _, j in found if abs(i - j) == 1}
-        pairs |= {(i, j) for j in chosen if (j, i) not in pairs}
-    return sorted(pairs)
-
-
-def _spread(found: list[tuple[float, int]], count: int) -> list[tuple[float, int]]:
-    """Half the best, half evenly from the rest: small overlaps are what ties a loop together."""
-    if len(found) <= count:
-        return found
-    head, tail = found[: count // 2], found[count // 2 :]
-    pick: NDArray[np.intp] = np.linspace(0, len(tail) - 1, count - len(head)).astype(np.intp)
-    return head + [tail[k] for k in pick]

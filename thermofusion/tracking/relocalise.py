@@ -12,7 +12,8 @@ from ..geometry import invert
 from ..recipe import TrackingSection
 from ..types import Float
 from .fragments import Fragment
-from .registration import DepthMap, Partners, register
+from .maps import DepthMap
+from .registration import Partners, register
 
 COARSE_REACHES_M = (0.3, 0.25, 0.2, 0.16, 0.13, 0.1, 0.08, 0.06, 0.05, 0.04)
 FINE_REACHES_M = (0.04, 0.03, 0.03, 0.02, 0.02, 0.02)

@@ -1,0 +1,124 @@
+"""Small depth scans with known truth: a lumpy, torso-like body cast by rays, seen by a camera that walks round it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from thermofusion._open3d import o3d
+from thermofusion.geometry import invert, pose, rigid_alignment
+from thermofusion.types import Camera, Float, Rig, Scan, Stream, Trajectory
+
+CAMERA = Camera(160, 120, np.array([[147.0, 0, 79.5], [0, 147.0, 59.5], [0, 0, 1]]))
+FLOOR_Y_M = 0.42  # below the body's middle (y points down)
+FRAME_S = 1 / 15
+
+
+@dataclass(frozen=True, eq=False)
+class Walk:
+    """depth_m : (N, H, W) float32, NaN = none. T_body_depth : (N, 4, 4) truth."""
+
+    depth_m: np.ndarray
+    T_body_depth: Float
+
+    def scan(self, *, recorded: Float | None = None) -> Scan:
+        """As a reader would present it. recorded : poses of a recorded trajectory."""
+        n = len(self.depth_m)
+        times = FRAME_S * np.arange(n)
+        stream = Stream(
+            times,
+            lambda i: self.depth_m[i].copy(),
+            tuple(f"depth/{i:06d}.png" for i in range(n)),
+            np.arange(n, dtype=np.int64),
+            np.ones(n, bool),
+        )
+        trajectory = None if recorded is None else Trajectory(times, recorded)
+        return Scan("walk", Path("walk"), "synthetic", Rig(CAMERA), stream, trajectory=trajectory)
+
+    def blanked(self, start: int, stop: int) -> Walk:
+        """Frames start..stop-1 hold no depth, as when somebody steps before the camera."""
+        depth = self.depth_m.copy()
+        depth[start:stop] = np.nan
+        return replace(self, depth_m=depth)
+
+    def without(self, start: int, stop: int) -> Walk:
+        """Frames start..stop-1 are missing from the recording: the camera jumps."""
+        keep = np.r_[0:start, stop : len(self.depth_m)]
+        return Walk(self.depth_m[keep], self.T_body_depth[keep])
+
+    def ate_mm(self, trajectory: Trajectory) -> float:
+        """RMS distance of camera positions after rigid alignment, over the frames of the trajectory."""
+        i = np.rint(trajectory.times_s / FRAME_S).astype(int)
+        p, q = trajectory.T_world_depth[:, :3, 3], self.T_body_depth[i, :3, 3]
+        T = rigid_alignment(p, q)
+        return float(1e3 * np.sqrt((((p @ T[:3, :3].T + T[:3, 3]) - q) ** 2).sum(1).mean()))
+
+
+def body(seed: int = 3) -> o3d.t.geometry.TriangleMesh:
+    """An ellipsoid of 40 x 70 x 26 cm with lumps of a few centimetres, as far from symmetric as a torso with arms."""
+    mesh = o3d.geometry.TriangleMesh.create_sphere(1.0, 80)
+    v = np.asarray(mesh.vertices)
+    rng = np.random.default_rng(seed)
+    centres = rng.normal(size=(24, 3))
+    centres /= np.linalg.norm(centres, axis=1, keepdims=True)
+    size = rng.uniform(-0.12, 0.18, 24)
+    bump = (size * np.exp(-(np.linalg.norm(v[:, None] - centres, axis=2) ** 2) / (2 * 0.22**2))).sum(1)
+    mesh.vertices = o3d.utility.Vector3dVector(v * (1 + bump)[:, None] * [0.20, 0.35, 0.13])
+    return o3d.t.geometry.TriangleMesh.from_legacy(mesh)
+
+
+def box(low: list[float], high: list[float]) -> o3d.t.geometry.TriangleMesh:
+    """An axis-parallel box between two corners, metres."""
+    size = np.subtract(high, low)
+    return o3d.t.geometry.TriangleMesh.create_box(*size).translate(o3d.core.Tensor(np.array(low, np.float32)))
+
+
+def floor() -> o3d.t.geometry.TriangleMesh:
+    """Four square metres under the body."""
+    return box([-1, FLOOR_Y_M, -1], [1, FLOOR_Y_M + 0.02, 1])
+
+
+def orbit(frames: int, turn_deg: float, *, distance_m: float = 1.0, seed: int = 5, down_m: float = 0.0) -> Float:
+    """T_body_depth (N, 4, 4) of a hand-held walk round the body, looking at its middle, from `down_m` above it."""
+    rng = np.random.default_rng(seed)
+    angle = np.radians(np.linspace(0, turn_deg, frames))
+    sway = np.cumsum(rng.normal(0, 1.5e-3, (frames, 3)), axis=0)
+    poses = []
+    for a, s in zip(angle, sway, strict=True):
+        eye = np.array([distance_m * np.sin(a), -down_m + 0.05 * np.sin(3 * a), -distance_m * np.cos(a)]) + s
+        z = np.array([0.0, 0.0, 0.0]) - eye
+        z /= np.linalg.norm(z)
+        x = np.cross([0, 1.0, 0], z)
+        x /= np.linalg.norm(x)
+        poses.append(pose(np.stack([x, np.cross(z, x), z], axis=1), eye))
+    return np.array(poses)
+
+
+def walk(T_body_depth: Float, *, room: tuple = (), standing: tuple = (), noise: float = 1.2e-3, seed: int = 1) -> Walk:
+    """Depth of the body, of a `room` that moves with it, and of things `standing` before the camera's own frame.
+
+    noise : standard deviation at 1 m, grows with range²; depth is rounded to millimetres, as sensors do.
+    """
+    rng = np.random.default_rng(seed)
+    scene, fixed = o3d.t.geometry.RaycastingScene(), o3d.t.geometry.RaycastingScene()
+    for mesh in (body(), *room):
+        scene.add_triangles(mesh)
+    for mesh in standing:
+        fixed.add_triangles(mesh)
+    frames = []
+    for T in T_body_depth:
+        z = _cast(scene, T)
+        if standing:
+            z = np.minimum(z, _cast(fixed, np.eye(4)))
+        z = z + rng.normal(0, noise, z.shape) * np.where(np.isfinite(z), z, 1) ** 2
+        frames.append(np.where(z < 4, np.round(z, 3), np.nan).astype(np.float32))
+    return Walk(np.array(frames), T_body_depth)
+
+
+def _cast(scene: o3d.t.geometry.RaycastingScene, T_scene_depth: Float) -> np.ndarray:
+    rays = o3d.t.geometry.RaycastingScene.create_rays_pinhole(
+        o3d.core.Tensor(CAMERA.K), o3d.core.Tensor(invert(T_scene_depth)), CAMERA.width_px, CAMERA.height_px
+    )
+    return scene.cast_rays(rays)["t_hit"].numpy().astype(np.float64)  # directions have z = 1: t is depth

@@ -1,0 +1,146 @@
+"""Depth frames as tracking uses them: coarser, the subject alone, with the colour camera's texture where it helps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..depthfilter import read_ahead
+from ..geometry import project, transform_points
+from ..recipe import Recipe
+from ..scans.pairing import pair_color
+from ..segmentation import SubjectFrames
+from ..types import Float32, Scan
+from .maps import DepthMap, Intrinsics
+
+WIDTH_PX = 320  # images are brought down to about this width
+SAMPLES = 3000  # points of a frame that are registered
+MIN_VALID_SHARE = 0.01  # a frame with fewer valid pixels shows nothing
+CELL_SPREAD = 0.03  # relative: pixels of one cell that differ more see two surfaces
+TEXTURE_WINDOW_PX = 15  # of the coarse colour image: intensity is what differs from the mean over this
+CONTRAST_FLOOR = 3.0  # grey levels of local contrast below which texture fades to nothing
+PROBES = 5
+SLIDES_BELOW = 0.1  # `stiffness_of` cylinders, spheres and bowls is 0.06 (what noise pretends), of bodies 0.13 to 0.35
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A depth frame as tracking uses it: coarse, subject only.
+
+    depth_m : (H, W) float32, NaN = none. map : its points, normals, texture.
+    """
+
+    index: int
+    time_s: float
+    depth_m: Float32
+    map: DepthMap
+
+    @property
+    def empty(self) -> bool:
+        return bool(np.isfinite(self.depth_m).mean() < MIN_VALID_SHARE)
+
+
+class TrackingFrames:
+    """Loads frames, ahead on threads.
+
+    Attributes
+    ----------
+    intrinsics : (fx, fy, cx, cy) of the coarse images. slides : the shape alone leaves some motion free, as a
+    cylinder's turn about its axis. uses_color : so texture has to help, and there is some. subject : the full frames.
+    """
+
+    def __init__(self, scan: Scan, recipe: Recipe) -> None:
+        self._scan, self.subject = scan, SubjectFrames(scan, recipe)
+        camera = self.subject.camera
+        self._step = s = max(1, round(camera.width_px / WIDTH_PX))
+        K = camera.K
+        # the centre of a cell of s x s pixels lies (s - 1)/2 from its first pixel's centre
+        cx, cy = (K[0, 2] - (s - 1) / 2) / s, (K[1, 2] - (s - 1) / 2) / s
+        self.intrinsics: Intrinsics = (K[0, 0] / s, K[1, 1] / s, cx, cy)
+        self.uses_color = False
+        self.slides = self._shape_slides()
+        if self.slides and recipe.tracking.color and scan.color is not None:
+            self._color_of = pair_color(scan, recipe.input.pair_tolerance_ms).color_index
+            self.uses_color = True
+
+    def load(self, i: int) -> Frame:
+        """Frame i of the depth stream."""
+        depth = coarse_depth(self.subject.load(i), self._step)
+        intensity = self._intensity(i, depth) if self.uses_color else None
+        return Frame(
+            i, float(self._scan.depth.times_s[i]), depth, DepthMap.of(depth, self.intrinsics, SAMPLES, intensity)
+        )
+
+    def read_ahead(self, indices: NDArray[np.intp]) -> Iterator[Frame]:
+        """Frames in order, a few prepared ahead."""
+        return read_ahead(self.load, indices.tolist())
+
+    def _shape_slides(self) -> bool:
+        usable = np.flatnonzero(self._scan.depth.usable)
+        probes = usable[np.linspace(0, len(usable) - 1, min(PROBES, len(usable))).astype(int)] if len(usable) else []
+        stiffness = [s for i in probes if np.isfinite(s := stiffness_of(self.load(int(i)).map))]
+        return bool(stiffness and np.median(stiffness) < SLIDES_BELOW)
+
+    def _intensity(self, i: int, depth: Float32) -> Float32 | None:
+        """Local contrast of the colour image at every depth pixel, about 1 in spread; NaN where there is none."""
+        rig, stream, color = self._scan.rig, self._scan.color, int(self._color_of[i])
+        if color < 0 or stream is None or rig.color is None or rig.T_color_depth is None:
+            return None
+        grey = cv2.cvtColor(stream.load(color), cv2.COLOR_RGB2GRAY).astype(np.float32)
+        step = max(1, round(grey.shape[1] / WIDTH_PX))
+        contrast = local_contrast(grey, step)
+        fx, fy, cx, cy = self.intrinsics
+        v, u = np.nonzero(np.isfinite(depth))
+        z = depth[v, u]
+        points = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=1).astype(np.float32)
+        uv, _ = project(rig.color, transform_points(rig.T_color_depth, points))
+        uv = ((uv - (step - 1) / 2) / step).astype(np.float32)
+        out = np.full(depth.shape, np.nan, np.float32)
+        on_image = np.full((2, *depth.shape), -10, np.float32)
+        on_image[:, v, u] = np.nan_to_num(uv.T, nan=-10)
+        cv2.remap(contrast, on_image[0], on_image[1], cv2.INTER_LINEAR, out, cv2.BORDER_CONSTANT, float("nan"))
+        return out
+
+
+def coarse_depth(depth_m: Float32, step: int) -> Float32:
+    """Mean depth over cells of `step` x `step` pixels, NaN where less than half is valid or two surfaces meet."""
+    if step == 1:
+        return depth_m
+    h, w = (n // step * step for n in depth_m.shape)
+    parts = [depth_m[r:h:step, c:w:step] for r in range(step) for c in range(step)]
+    total, count = np.zeros_like(parts[0]), np.zeros(parts[0].shape, np.uint8)
+    low, high = parts[0], parts[0]
+    for part in parts:
+        valid = part == part  # False where NaN
+        total += np.where(valid, part, np.float32(0))
+        count += valid
+        low, high = np.fmin(low, part), np.fmax(high, part)
+    good = (2 * count >= len(parts)) & (high - low < np.float32(CELL_SPREAD) * low)
+    return np.divide(total, count, out=np.full_like(total, np.nan), where=good)
+
+
+def local_contrast(grey: Float32, step: int) -> Float32:
+    """(I - local mean) / local spread of an image reduced by `step`: what light and exposure leave unchanged."""
+    size = (grey.shape[1] // step, grey.shape[0] // step)
+    image = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    window = (TEXTURE_WINDOW_PX, TEXTURE_WINDOW_PX)
+    mean = cv2.blur(image, window)
+    spread = np.sqrt(np.maximum(cv2.blur(image * image, window) - mean * mean, 0))
+    return np.asarray((image - mean) / (spread + np.float32(CONTRAST_FLOOR)))
+
+
+def stiffness_of(depth_map: DepthMap) -> float:
+    """How well a shape holds itself in place: root of the smallest eigenvalue of the normal equations per point, with
+    turns measured at the shape's own radius. 0 for a sphere, a cylinder, a plane; NaN for nothing.
+    """
+    p, n = depth_map.sample, depth_map.sample_normals
+    if len(p) < 100:
+        return float("nan")
+    p = p - p.mean(0)
+    radius = np.sqrt((p**2).sum(1).mean())
+    J = np.concatenate([np.cross(p / radius, n), n], axis=1)
+    return float(np.sqrt(max(np.linalg.eigvalsh(J.T @ J / len(J))[0], 0)))
