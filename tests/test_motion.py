@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from walkround import ROOM_DEGC, ellipsoid, make_scan, walk
+from walkround import blank, ellipsoid, make_scan, walk
 
 from thermofusion.geometry import invert, se3_exp, transform_points
 from thermofusion.motion import view_corrections
 from thermofusion.scans.pairing import thermal_views
-from thermofusion.types import SurfaceMesh
+from thermofusion.types import Scan, SurfaceMesh
 
 
 @pytest.fixture(scope="module")
 def body() -> SurfaceMesh:
     return ellipsoid()
+
+
+@pytest.fixture(scope="module")
+def still(body) -> Scan:
+    return make_scan(body, walk())
 
 
 def test_swaying_subject(body):
@@ -41,20 +46,18 @@ def test_swaying_subject(body):
     assert across_m(result.T_world_thermal) < 0.001
 
 
-def test_still_subject_is_left_alone(body):
-    scan = make_scan(body, walk())
-    views, _ = thermal_views(scan, walk(), 0.5)
-    result = view_corrections(scan, body, views)
+def test_still_subject_is_left_alone(body, still):
+    views, _ = thermal_views(still, walk(), 0.5)
+    result = view_corrections(still, body, views)
     assert not result.kept
     np.testing.assert_array_equal(result.T_world_thermal, views.T_world_thermal)
     assert np.median(result.correction_mm) < 1.5  # mostly along the line of sight, where an outline says little
     assert "not kept" in result.messages[0]
 
 
-def test_nothing_to_see(body):
-    scan = make_scan(body, walk(), skin_degC=ROOM_DEGC)
-    views, _ = thermal_views(scan, walk(), 0.5)
-    result = view_corrections(scan, body, views)
+def test_nothing_to_see(body, still):
+    views, _ = thermal_views(still, walk(), 0.5)
+    result = view_corrections(blank(still), body, views)
     assert not result.kept
     assert result.views_fitted == 0
     assert np.isnan(result.residual_px_before)

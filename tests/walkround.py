@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -50,7 +52,7 @@ def walk(duration_s: float = 8.0, tremor: float = 1.0) -> Trajectory:
     return Trajectory(t, np.stack([pose(r, e) for r, e in zip(R, eye, strict=True)]) @ se3_exp(shake))
 
 
-def render(mesh: SurfaceMesh, T_world_thermal: np.ndarray, skin_degC: float, seed: int) -> np.ndarray:
+def render(mesh: SurfaceMesh, T_world_thermal: np.ndarray, seed: int) -> np.ndarray:
     """What the camera reports, °C: 2 x 2 rays a pixel, emissivity falling at the limb, point spread, noise, offset."""
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(o3d.core.Tensor(mesh.vertices_m), o3d.core.Tensor(mesh.triangles.astype(np.uint32)))
@@ -61,7 +63,7 @@ def render(mesh: SurfaceMesh, T_world_thermal: np.ndarray, skin_degC: float, see
     hit = np.isfinite(t)
     p = eye + np.where(hit, t, 0)[..., None] * rays
     cos = np.abs((answer["primitive_normals"].numpy() * rays).sum(-1))
-    pattern = skin_degC + (skin_degC != ROOM_DEGC) * np.sin(12 * p[..., 0] + 3) * np.cos(15 * p[..., 2])
+    pattern = SKIN_DEGC + np.sin(12 * p[..., 0] + 3) * np.cos(15 * p[..., 2])
     emissivity = 0.98 * (1 - (1 - cos) ** 5)
     image = np.where(hit, ROOM_DEGC + emissivity * (pattern - ROOM_DEGC), ROOM_DEGC)
     image = image.reshape(240, 2, 320, 2).mean((1, 3))
@@ -69,9 +71,7 @@ def render(mesh: SurfaceMesh, T_world_thermal: np.ndarray, skin_degC: float, see
     return (cv2.GaussianBlur(image, (0, 0), 0.8) + noise + 0.5 * np.sin(seed)).astype(np.float32)
 
 
-def make_scan(
-    mesh: SurfaceMesh, trajectory: Trajectory, *, skin_degC: float = SKIN_DEGC, sway: np.ndarray | None = None
-) -> Scan:
+def make_scan(mesh: SurfaceMesh, trajectory: Trajectory, *, sway: np.ndarray | None = None) -> Scan:
     """24 thermal frames. sway : (24, 6) twist in the world frame by which the body has moved in each, or None."""
     taken = np.linspace(0.3, trajectory.times_s[-1] - 0.3, 24)
     T_world_depth, _ = interpolate_trajectory(trajectory, taken)
@@ -79,7 +79,7 @@ def make_scan(
     T_world_thermal = (
         invert(se3_exp(np.zeros((24, 6)) if sway is None else sway)) @ T_world_depth @ invert(T_THERMAL_DEPTH)
     )
-    images = [render(mesh, T, skin_degC, i) for i, T in enumerate(T_world_thermal)]
+    images = [render(mesh, T, i) for i, T in enumerate(T_world_thermal)]
     places, index = tuple(f"thermal {i}" for i in range(24)), np.arange(24)
     thermal = Stream(taken, lambda i: images[i], places, index, np.ones(24, bool))
     depth = Stream(np.zeros(0), lambda i: np.zeros(0), (), np.zeros(0, np.int64), np.zeros(0, bool))
@@ -87,3 +87,16 @@ def make_scan(
     return Scan(
         "ellipsoid", Path(), "made", Rig(DEPTH, THERMAL, T_THERMAL_DEPTH), depth, thermal=thermal, sensor=sensor
     )
+
+
+def repainted(scan: Scan, paint: Callable[[np.ndarray], np.ndarray]) -> Scan:
+    """The same scan with every thermal image changed by `paint`."""
+    stream = scan.thermal
+    return replace(scan, thermal=replace(stream, load=lambda i: paint(stream.load(i)).astype(np.float32)))
+
+
+def blank(scan: Scan) -> Scan:
+    """The same scan of a body as warm as the room: noise alone."""
+    rng = np.random.default_rng(0)
+    images = ROOM_DEGC + rng.normal(0, NETD_K, (len(scan.thermal), *THERMAL.shape)).astype(np.float32)
+    return replace(scan, thermal=replace(scan.thermal, load=lambda i: images[i]))

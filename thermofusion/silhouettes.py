@@ -1,9 +1,9 @@
 """Where the model's outline should stand in a thermal image, and where the image shows it.
 
 Only outlines against the empty background are used: rays of a coarse pixel grid find where the surface ends, bisection
-finds the end to a fraction of a pixel. A true occluding contour is seen edge-on; the rim of a hole or of the cut at the
-waist is not, and is dropped by that (the body goes on where the mesh does not). The image's edge is the steepest step
-along the outline's normal.
+finds the end to a fraction of a pixel. A true occluding contour is seen edge-on, and away from the mesh's open borders;
+the rim of a hole or of the cut at the waist is dropped (the body goes on where the mesh does not). The image's edge is
+the steepest step along the outline's normal.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from .geometry import pixel_rays, project, transform_points
 from .types import Camera, Float, Float32, SurfaceMesh
@@ -21,6 +22,7 @@ from .types import Camera, Float, Float32, SurfaceMesh
 GRID_STEPS_ACROSS = 160  # coarse pixel grid: an image is this many steps wide
 BISECTIONS = 6  # of one grid step: below a tenth of a pixel
 EDGE_ON_COS = 0.5  # an occluding contour is seen edge-on; noisy, window-averaged normals are up to 30° off
+BORDER_M = 0.015  # outline this near to an open border of the mesh is not believed
 PROFILE_STEP_PX = 0.5
 BLUR_SIGMA_PX = 1.0  # of the image before its steepest step is looked for: noise of the derivative
 CLIMB = 4  # steps from a preferred place on an edge to its top
@@ -63,6 +65,7 @@ class OutlineCaster:
             self._tensor(np.ascontiguousarray(mesh.triangles, np.uint32)),
         )
         self._mesh = mesh
+        self._border = _border_tree(mesh)
         self._step = max(1, round(camera.width_px / GRID_STEPS_ACROSS))
         u, v = np.meshgrid(
             np.arange(self._step / 2, camera.width_px, self._step),
@@ -107,7 +110,21 @@ class OutlineCaster:
         point = (eye + t[keep, None] * directions[keep]).astype(np.float64)
         cos = (normal * directions[keep]).sum(1) / np.linalg.norm(directions[keep], axis=1)
         edge_on = np.abs(cos) < EDGE_ON_COS
-        return Contour(point[edge_on], normal[edge_on])
+        point, normal = point[edge_on], normal[edge_on]
+        if self._border is not None and len(point):
+            inside = ~np.isfinite(self._border.query(point, distance_upper_bound=BORDER_M)[0])
+            point, normal = point[inside], normal[inside]
+        return Contour(point, normal)
+
+
+def _border_tree(mesh: SurfaceMesh) -> cKDTree | None:
+    """Search tree of the vertices on open borders: on edges with one triangle only. None for a closed mesh."""
+    t = mesh.triangles.astype(np.int64)
+    a, b = np.concatenate([t[:, 0], t[:, 1], t[:, 2]]), np.concatenate([t[:, 1], t[:, 2], t[:, 0]])
+    code, count = np.unique(np.minimum(a, b) << 32 | np.maximum(a, b), return_counts=True)
+    single = code[count == 1]
+    ends = np.unique(np.concatenate([single >> 32, single & 0xFFFFFFFF]))
+    return cKDTree(mesh.vertices_m[ends]) if len(ends) else None
 
 
 @dataclass(frozen=True, eq=False)
