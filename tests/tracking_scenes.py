@@ -1,4 +1,4 @@
-"""Small depth scans with known truth: a lumpy, torso-like body cast by rays, seen by a camera that walks round it."""
+"""Small depth scans with known truth: a body of a few ellipsoids cast by rays, seen by a camera that walks round it."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from thermofusion._open3d import o3d
 from thermofusion.geometry import invert, pose, rigid_alignment
@@ -56,16 +57,24 @@ class Walk:
         return float(1e3 * np.sqrt((((p @ T[:3, :3].T + T[:3, 3]) - q) ** 2).sum(1).mean()))
 
 
-def body(seed: int = 3) -> o3d.t.geometry.TriangleMesh:
-    """An ellipsoid of 40 x 70 x 26 cm with lumps of a few centimetres, as far from symmetric as a torso with arms."""
-    mesh = o3d.geometry.TriangleMesh.create_sphere(1.0, 80)
-    v = np.asarray(mesh.vertices)
-    rng = np.random.default_rng(seed)
-    centres = rng.normal(size=(24, 3))
-    centres /= np.linalg.norm(centres, axis=1, keepdims=True)
-    size = rng.uniform(-0.12, 0.18, 24)
-    bump = (size * np.exp(-(np.linalg.norm(v[:, None] - centres, axis=2) ** 2) / (2 * 0.22**2))).sum(1)
-    mesh.vertices = o3d.utility.Vector3dVector(v * (1 + bump)[:, None] * [0.20, 0.35, 0.13])
+def body() -> list[o3d.t.geometry.TriangleMesh]:
+    """Trunk, head, one arm forward and one to the side: as far from symmetric as a person."""
+    return [
+        ellipsoid([0, 0, 0], [0.17, 0.33, 0.11], 0),
+        ellipsoid([0.01, -0.37, -0.03], [0.075, 0.11, 0.095], 0),
+        ellipsoid([-0.22, -0.02, -0.07], [0.045, 0.26, 0.05], 25),
+        ellipsoid([0.24, -0.05, 0.03], [0.05, 0.25, 0.045], -35),
+        ellipsoid([0.07, -0.12, -0.09], [0.06, 0.06, 0.05], 0),
+        ellipsoid([-0.05, 0.14, -0.08], [0.09, 0.07, 0.06], 0),
+    ]
+
+
+def ellipsoid(centre: list[float], radii: list[float], tilt_deg: float) -> o3d.t.geometry.TriangleMesh:
+    """An ellipsoid, tilted about the viewing axis of the first pose and, half as much, about the horizontal."""
+    mesh = o3d.geometry.TriangleMesh.create_sphere(1.0, 40)
+    R = Rotation.from_euler("zx", [tilt_deg, tilt_deg / 2], degrees=True).as_matrix()
+    v = np.asarray(mesh.vertices) * radii
+    mesh.vertices = o3d.utility.Vector3dVector(v @ R.T + centre)
     return o3d.t.geometry.TriangleMesh.from_legacy(mesh)
 
 
@@ -103,7 +112,7 @@ def walk(T_body_depth: Float, *, room: tuple = (), standing: tuple = (), noise: 
     """
     rng = np.random.default_rng(seed)
     scene, fixed = o3d.t.geometry.RaycastingScene(), o3d.t.geometry.RaycastingScene()
-    for mesh in (body(), *room):
+    for mesh in (*body(), *room):
         scene.add_triangles(mesh)
     for mesh in standing:
         fixed.add_triangles(mesh)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ScanError
-from ..geometry import interpolate_trajectory, invert
+from ..geometry import interpolate_trajectory, invert, se3_exp, se3_log
 from ..recipe import Recipe
 from ..types import Bool, Float, Scan, Trajectory
 from .fragments import Fragment
@@ -33,6 +33,7 @@ PARTNERS_PER_FRAGMENT = 8
 MIN_OVERLAP = 0.2
 FRAME_REACHES_M = (0.02, 0.015, 0.01)
 FRAME_TARGETS = 3
+SPEED_FRAMES = 5  # over which the motion before a break is taken
 LOOP_APART = 3  # fragments this far apart in time that overlap close a loop
 MIN_FLOOR_SHARE = 0.05  # of frames that must show a floor for it to count as found
 
@@ -103,7 +104,7 @@ def track(scan: Scan, recipe: Recipe, *, progress: Progress | None = None) -> Tr
             place=scan.root,
             hint="check depth_unit_m and the recipe's range",
         )
-    placed, lost = _join(segments, recipe)
+    placed, lost = _join(segments, frames, scan.depth.times_s, recipe)
     placed, loops, converged, message = _solve(placed, recipe)
     return _result(scan, frames, indices, placed, lost, loops, converged, message)
 
@@ -140,37 +141,53 @@ def _from_recorded(
     return [] if growing is None else [growing.finished()]
 
 
-def _join(segments: list[Segment], recipe: Recipe) -> tuple[list[_Placed], list[LostRange]]:
+def _join(
+    segments: list[Segment], frames: TrackingFrames, times_s: Float, recipe: Recipe
+) -> tuple[list[_Placed], list[LostRange]]:
     """Put segments together around the longest; what cannot be joined is left out, and said."""
     longest = int(np.argmax([len(s.frames) for s in segments]))
     placed = {longest: _Placed(segments[longest], _in_segment(segments[longest]))}
-    waiting = [k for k in range(len(segments)) if k != longest]
-    how: dict[int, str] = {longest: "the longest"}
-    moved = True
-    while waiting and moved:
-        moved = False
-        for k in sorted(waiting, key=lambda k: min(abs(k - p) for p in placed)):
-            main = [f for p in sorted(placed) for f in placed[p].fragments]
-            own = list(zip(segments[k].fragments, _in_segment(segments[k]), strict=True))
-            join = find_join(main, own, _neighbours(k, segments, placed), recipe.tracking)
-            if join is None:
-                continue
-            placed[k] = _Placed(segments[k], tuple(join.T_main_segment @ T for _, T in own))
-            how[k] = join.how
-            waiting.remove(k)
-            moved = True
-            break
+    how, doubt = {longest: "the longest"}, dict[int, str]()
+    waiting = {k for k in range(len(segments)) if k != longest}
+    todo = sorted(waiting, key=lambda k: (abs(k - longest), k))
+    while todo:
+        k = todo.pop(0)
+        main = [f for p in sorted(placed) for f in placed[p].fragments]
+        own = list(zip(segments[k].fragments, _in_segment(segments[k]), strict=True))
+        guesses = _neighbours(k, segments, placed, times_s)
+        join = None
+        for probe, T in _probes(own, k - 1 in placed, k + 1 in placed):
+            join = find_join(main, probe, T, guesses, frames.up(probe.middle), recipe.tracking)
+            if join is not None and not join.ambiguous:
+                break
+        if join is None or join.ambiguous:
+            doubt[k] = "no place in the model convinced" if join is None else "more than one place in the model fits"
+            continue
+        placed[k] = _Placed(segments[k], tuple(join.T_main_segment @ T for _, T in own))
+        how[k] = join.how
+        waiting.remove(k)
+        # its neighbours in time have a new guess: they come next, again if they were tried
+        todo = [n for n in (k - 1, k + 1) if n in waiting] + [n for n in todo if n not in (k - 1, k + 1)]
+    return [placed[k] for k in sorted(placed)], _lost(segments, placed, how, doubt)
+
+
+def _lost(
+    segments: list[Segment], placed: dict[int, _Placed], how: dict[int, str], doubt: dict[int, str]
+) -> list[LostRange]:
+    """Every break between segments, and every segment that found no place."""
     lost = []
     for k in range(1, len(segments)):
         start, stop = int(segments[k - 1].frames[-1]) + 1, int(segments[k].frames[0])
         if stop > start:
             lost.append(LostRange(start, stop, "empty", "nothing of the subject in view"))
         if k in placed and k - 1 in placed:
-            lost.append(LostRange(stop, stop + 1, "joined", f"tracking broke here; joined again {how[k]}"))
-    for k in waiting:
-        s = segments[k].frames
-        lost.append(LostRange(int(s[0]), int(s[-1]) + 1, "left out", "no place in the model convinced"))
-    return [placed[k] for k in sorted(placed)], sorted(lost, key=lambda r: r.start)
+            way = how[k] if how[k] != "the longest" else how[k - 1]
+            lost.append(LostRange(stop, stop + 1, "joined", f"tracking broke here; joined again {way}"))
+    for k, why in doubt.items():
+        if k not in placed:
+            s = segments[k].frames
+            lost.append(LostRange(int(s[0]), int(s[-1]) + 1, "left out", why))
+    return sorted(lost, key=lambda r: r.start)
 
 
 def _in_segment(segment: Segment) -> tuple[Float, ...]:
@@ -179,13 +196,27 @@ def _in_segment(segment: Segment) -> tuple[Float, ...]:
     return tuple(segment.T[row[int(f.frames[len(f.frames) // 2])]] for f in segment.fragments)
 
 
-def _neighbours(k: int, segments: list[Segment], placed: dict[int, _Placed]) -> list[Float]:
-    """Guesses T_main_segment: the camera where it was just before, or just after, the break."""
+def _probes(own: list[tuple[Fragment, Float]], before: bool, after: bool) -> list[tuple[Fragment, Float]]:
+    """The fragments to try: the end that is next to a placed segment first, then the other, then the middle."""
+    order = [0, -1] if before or not after else [-1, 0]
+    picked = [k % len(own) for k in (*order, len(own) // 2)]
+    return [own[k] for k in dict.fromkeys(picked)]
+
+
+def _neighbours(k: int, segments: list[Segment], placed: dict[int, _Placed], times_s: Float) -> list[Float]:
+    """Guesses T_main_segment: the camera walked on as before (or as after) the break, or it stood."""
     guesses = []
-    if k - 1 in placed:
-        guesses.append(placed[k - 1].frame_poses()[-1] @ invert(segments[k].T[0]))
-    if k + 1 in placed:
-        guesses.append(placed[k + 1].frame_poses()[0] @ invert(segments[k].T[-1]))
+    for other, here, there in ((k - 1, 0, -1), (k + 1, -1, 0)):
+        if other not in placed:
+            continue
+        poses, frames, mine = placed[other].frame_poses(), segments[other].frames, segments[k]
+        back = -min(SPEED_FRAMES, len(poses)) if there == -1 else min(SPEED_FRAMES, len(poses)) - 1
+        dt_s = times_s[frames[there]] - times_s[frames[back]]
+        gap_s = times_s[mine.frames[here]] - times_s[frames[there]]
+        if dt_s != 0:
+            velocity = se3_log(invert(poses[back]) @ poses[there]) / dt_s
+            guesses.append(poses[there] @ se3_exp(velocity * gap_s) @ invert(mine.T[here]))
+        guesses.append(poses[there] @ invert(mine.T[here]))
     return guesses
 
 

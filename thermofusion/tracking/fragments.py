@@ -26,6 +26,11 @@ class Fragment:
     T_middle_frame: Float
     map: DepthMap
 
+    @property
+    def middle(self) -> int:
+        """Position in the depth stream of the frame in whose view it stands."""
+        return int(self.frames[len(self.frames) // 2])
+
 
 def build_fragment(frames: Sequence[Frame], T: Float, intrinsics: Intrinsics) -> Fragment:
     """Average the frames' depth in the view of the middle one.

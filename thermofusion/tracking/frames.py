@@ -14,7 +14,7 @@ from ..geometry import project, transform_points
 from ..recipe import Recipe
 from ..scans.pairing import pair_color
 from ..segmentation import SubjectFrames
-from ..types import Float32, Scan
+from ..types import Float, Float32, Scan
 from .maps import DepthMap, Intrinsics
 
 WIDTH_PX = 320  # images are brought down to about this width
@@ -78,6 +78,11 @@ class TrackingFrames:
     def read_ahead(self, indices: NDArray[np.intp]) -> Iterator[Frame]:
         """Frames in order, a few prepared ahead."""
         return read_ahead(self.load, indices.tolist())
+
+    def up(self, i: int) -> Float:
+        """(3,) in frame i's camera: away from the floor where it is seen, else up in the image."""
+        floor = self.subject.floors.get(i)
+        return np.array([0.0, -1.0, 0.0]) if floor is None else floor.plane[:3]
 
     def _shape_slides(self) -> bool:
         usable = np.flatnonzero(self._scan.depth.usable)

@@ -14,13 +14,12 @@ from ..types import Float
 from .fragments import Fragment, build_fragment
 from .frames import Frame, TrackingFrames
 from .maps import DepthMap
-from .registration import Partners, find_partners, register
+from .registration import REACH_M, Partners, find_partners, register
 
 REACHES_M = (0.08, 0.05, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03)
 # A second try from standing still, with a far reach: for a jerk that the last motion did not announce.
 RESCUE_REACHES_M = (0.15, 0.15, 0.12, 0.12, 0.1, 0.1, 0.08, 0.06, 0.05, 0.04, 0.03, 0.03, 0.03, 0.03)
 STEP_TOLERANCE = 2e-5  # rad and m: well below what one frame's noise allows
-REACH_M = 0.05  # of the partners that judge a motion
 MAX_SPEED_M_S, MAX_SPEED_DEG_S = 2.5, 180.0  # faster is no walk: a failure
 MIN_STEP_M, MIN_STEP_DEG = 0.06, 6.0
 MAX_GAP_FRAMES = 5  # empty frames that a segment may step over

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..geometry import invert, se3_exp
 from ..types import Float
@@ -19,6 +20,7 @@ from .maps import DepthMap
 MAX_NORMAL_DEG = 45.0  # partners must face alike
 MIN_PARTNERS = 150
 NOISE_FLOOR_M = 3e-4
+REACH_M = 0.05  # of the partners that judge a motion
 INTENSITY_FLOOR = 0.05  # of the normalised intensity, whose local spread is about 1
 
 
@@ -88,6 +90,38 @@ def find_partners(
         color = _color_rows(p[chosen], source.sample_intensity[::stride][chosen], texture, off, fx, fy)
     share = float(good.mean()) if len(good) else 0.0
     return Partners(Rows(p[chosen], n[good], r[good]), color, share, len(source.sample[::stride]))
+
+
+@dataclass(frozen=True)
+class Seen:
+    """How one view's points look from another: agree with its surface; stand where it saw through, or saw nothing;
+    the rest is hidden behind its surface or outside its image. sent : all."""
+
+    agree: int
+    conflict: int
+    sent: int
+
+
+def compare(source: DepthMap, target: DepthMap, T_target_source: Float, reach_m: float, stride: int = 1) -> Seen:
+    """Whether the target, from where it is, could have taken its image of the source's points."""
+    partners = find_partners(source, target, T_target_source, reach_m, stride)
+    p = source.sample[::stride] @ T_target_source[:3, :3].T + T_target_source[:3, 3]
+    n = source.sample_normals[::stride] @ T_target_source[:3, :3].T
+    pixel, ahead = _pixels(target, p)
+    front = np.einsum("ij,ij->i", p[ahead], n[ahead]) < 0  # what turns its back is hidden by itself
+    depth = target.surface[pixel[front], 2]
+    empty, through = np.isnan(depth), depth > p[ahead][front, 2] + reach_m
+    return Seen(len(partners), int((empty | through).sum()), len(p))
+
+
+def _pixels(target: DepthMap, p: Float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Flat pixel of each point of the target's frame that falls inside its image, and which points those are."""
+    fx, fy, cx, cy = target.intrinsics
+    h, w = target.shape
+    z = np.maximum(p[:, 2], 1e-3)
+    column, row = np.rint(p[:, 0] / z * fx + cx), np.rint(p[:, 1] / z * fy + cy)
+    inside = np.flatnonzero((p[:, 2] > 0.1) & (column >= 0) & (row >= 0) & (column < w) & (row < h))
+    return row[inside].astype(np.intp) * w + column[inside].astype(np.intp), inside
 
 
 def _color_rows(p: Float, intensity: Float, texture: Float, off_px: Float, fx: float, fy: float) -> Rows:
