@@ -19,6 +19,7 @@ from .blending import BlendResult, blend, remove_air_path
 from .crosscal import CrosscalResult, cross_calibrate
 from .emissivity import EmissivityModel, model_from_recipe
 from .errors import RecipeError, ScanError
+from .motion import MotionResult, view_corrections
 from .projection import SurfaceRays, observe
 from .radiometry import ZERO_DEGC_K, Band, SignalConverter
 from .recipe import RadiometrySection, Recipe
@@ -56,13 +57,14 @@ CONTACT_RADIUS_M, CONTACT_FAR_M = 0.006, 0.03
 class Seen:
     """What the thermal views saw: observations of vertices, and readings of blackbodies.
 
-    left_out : thermal frames that did not enter, by reason.
+    left_out : thermal frames that did not enter, by reason. motion : corrections of single views, if asked for.
     """
 
     views: ThermalViews
     left_out: dict[str, int]
     observations: Observations
     blackbodies: tuple[BlackbodyReading, ...]
+    motion: MotionResult | None = None
 
 
 def see(
@@ -83,9 +85,13 @@ def see(
         T_thermal_depth=alignment.T_thermal_depth,
         time_offset_s=alignment.time_offset_s,
     )
+    motion = None
+    if recipe.crosscal.motion:
+        motion = view_corrections(scan, surface, views, alignment)
+        views = replace(views, T_world_thermal=motion.T_world_thermal)
     converter = SignalConverter(scan.sensor)
     observations = observe(scan, SurfaceRays(surface), views, converter.radiance, recipe.mapping, progress=progress)
-    return Seen(views, left_out, observations, _read_blackbodies(scan, views, converter, recipe))
+    return Seen(views, left_out, observations, _read_blackbodies(scan, views, converter, recipe), motion)
 
 
 @dataclass(frozen=True, eq=False)

@@ -54,6 +54,15 @@ def result_report(
             "observations": len(seen.observations),
             "blackbody_readings": len(seen.blackbodies),
         }
+        if seen.motion is not None:
+            m = seen.motion
+            kept = {
+                "kept": m.kept,
+                "residual_px_before": m.residual_px_before,
+                "residual_px_after": m.residual_px_after,
+            }
+            report["views"]["motion"] = {**kept, "correction_mm": m.correction_mm}
+            messages += m.messages
     if temperature is not None:
         report["temperature"] = _temperature(temperature)
         messages += temperature.messages
