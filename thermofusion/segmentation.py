@@ -18,19 +18,20 @@ from .geometry import pixel_rays
 from .recipe import Recipe
 from .types import Bool, Camera, Float, Float32, Scan
 
-STEP_PX = 8  # planes are looked for on every eighth pixel of every eighth row
+GRID = 80  # planes are looked for on about this many pixels of a row, and as densely along columns
 HYPOTHESES = 200
 MAX_TILT_DEG = 45.0  # of the floor's normal against the camera's up: how far a walking person pitches a camera
 FLOOR_TOLERANCE_M = 0.012  # at 1 m, grows with range²
 MIN_FLOOR_SHARE = 0.04  # of the valid pixels
 MAX_BELOW_SHARE = 0.02  # nothing lies below a floor
-MIN_EXTENT_M = 0.11  # rms extent of the floor's narrower direction: smaller patches are laps and shoulders
-TRACKING_CLEARANCE_M = 0.03  # tracking is better off without what is this near to the floor
+MIN_EXTENT_M = 0.11  # rms extent of the floor's narrower direction, at 1 m and beyond: less is a lap or a shoulder
+TRACKING_CLEARANCE_M = 0.03  # at 1 m and beyond: tracking is better off without what is this near to the floor
 JUMP_AT_1M = 0.05  # depth step between neighbours (times range) that separates two things
 BEHIND_M = 0.30  # clear air between subject and background
 STATIC_FRAMES = 24
 STATIC_SPREAD_AT_1M = 0.012  # a pixel whose depth stays within this (times range²) shows something that does not move
-STATIC_SHARE = 0.6
+STATIC_QUANTILE = 0.85  # of a pixel's depths: its far end, without the farthest outliers
+STATIC_SHARE = 0.3  # of frames in which a pixel must see the room at its far end
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,9 +55,7 @@ class SubjectFrames:
         self.camera: Camera = self._frames.camera
         rays = pixel_rays(self.camera)
         self._rays: Float32 = (rays / rays[..., 2:]).astype(np.float32)
-        self._static = None
-        if recipe.subject.motion == "subject":
-            self._static = static_background(self._frames)
+        self._static = static_scene(self._frames) if recipe.subject.motion == "subject" else None
         self.floors: dict[int, FloorPlane] = {}
 
     def __len__(self) -> int:
@@ -65,14 +64,15 @@ class SubjectFrames:
     def load(self, i: int) -> Float32:
         """Frame i, (H, W) float32 metres, NaN = not the subject."""
         depth = self._frames.load(i)
-        if self._static is not None:
-            depth = np.where(self._static, np.float32(np.nan), depth)
         if self._subject.floor != "keep":
             floor = find_floor(depth, self._rays)
             if floor is not None:
                 self.floors[i] = floor
                 height = (self._rays @ floor.plane[:3].astype(np.float32)) * depth + np.float32(floor.plane[3])
-                depth = np.where(height > TRACKING_CLEARANCE_M, depth, np.float32(np.nan))
+                depth = np.where(height > TRACKING_CLEARANCE_M * np.minimum(1, depth), depth, np.float32(np.nan))
+        if self._static is not None:
+            room = depth > self._static - static_tolerance(self._static)
+            depth = np.where(room, np.float32(np.nan), depth)
         if self._subject.background == "remove":
             depth[behind_subject(depth)] = np.nan
         return depth
@@ -88,11 +88,12 @@ def find_floor(depth_m: Float32, rays: Float32, *, seed: int = 0) -> FloorPlane 
     rays : (H, W, 3) directions with z = 1. RANSAC over a grid of pixels with a fixed seed, then least squares.
     None where there is no such plane.
     """
-    z = depth_m[::STEP_PX, ::STEP_PX].ravel()
+    step = max(1, round(depth_m.shape[1] / GRID))
+    z = depth_m[::step, ::step].ravel()
     valid = np.isfinite(z)
     if valid.sum() < 200:
         return None
-    p = rays[::STEP_PX, ::STEP_PX].reshape(-1, 3)[valid] * z[valid, None]
+    p = rays[::step, ::step].reshape(-1, 3)[valid] * z[valid, None]
     a, b, c = p[np.random.default_rng(seed).integers(0, len(p), (3, HYPOTHESES))]
     n = np.cross(b - a, c - a)
     length = np.linalg.norm(n, axis=1)
@@ -118,7 +119,8 @@ def find_floor(depth_m: Float32, rays: Float32, *, seed: int = 0) -> FloorPlane 
         _, s, axes = np.linalg.svd(p[inliers] - centre, full_matrices=False)
         normal = axes[2] * (-1 if axes[2, 1] > 0 else 1)
         plane, extent = np.append(normal, -(normal @ centre)).astype(np.float64), float(s[1] / np.sqrt(inliers.sum()))
-    return FloorPlane(plane, float(inliers.mean())) if extent > MIN_EXTENT_M else None
+    smallest = MIN_EXTENT_M * min(1.0, float(np.median(p[inliers, 2])))
+    return FloorPlane(plane, float(inliers.mean())) if extent > smallest else None
 
 
 def behind_subject(depth_m: Float32) -> Bool:
@@ -167,24 +169,25 @@ def _pieces(depth_m: Float32) -> tuple[NDArray, int]:
     return labels, n - 1
 
 
-def static_background(frames: DepthFrames) -> Bool:
-    """Pixels (H, W) of what does not move while the subject turns before a standing camera.
+def static_scene(frames: DepthFrames) -> Float32:
+    """Depth (H, W) of what does not move while the subject turns before a standing camera; NaN = not known.
 
-    A pixel is static when its depth hardly varies over frames spread through the recording; a piece of the image (cut
-    at depth steps) is background when most of it is static.
+    Of a pixel's depths over frames spread through the recording, the far end is the room behind the subject where the
+    pixel came back to it often enough. A pixel that always saw the turning subject comes back to no depth.
     """
     picked: Sequence[int] = np.unique(np.linspace(0, len(frames) - 1, STATIC_FRAMES).astype(int)).tolist()
-    stack = np.stack([d[::2, ::2] for _, d in frames.read_ahead(picked)])
+    stack = np.sort(np.stack([d[::2, ::2] for _, d in frames.read_ahead(picked)]), axis=0)  # NaN comes last
     seen = np.isfinite(stack).sum(0)
-    typical = np.nanmedian(np.where(seen > 0, stack, 9.0), axis=0).astype(np.float32)
-    with np.errstate(invalid="ignore"):
-        spread = np.nanmedian(np.abs(np.where(seen > 0, stack, 9.0) - typical), axis=0) * 2
-    present = seen >= 0.5 * len(stack)
-    static = present & (spread < STATIC_SPREAD_AT_1M * typical**2)
-    labels, n = _pieces(np.where(present, typical, np.nan).astype(np.float32))
-    size = np.maximum(np.bincount(labels.ravel(), minlength=n + 1), 1)
-    share = np.bincount(labels.ravel(), static.ravel(), n + 1) / size
-    room = (share > STATIC_SHARE) & (np.arange(n + 1) > 0)
-    mask = (room[labels] | (static & (labels == 0))).astype(np.uint8)
+    far = np.take_along_axis(
+        stack, np.maximum((STATIC_QUANTILE * seen).astype(int), 0)[None].clip(max=len(stack) - 1), 0
+    )[0]
+    returns = (np.abs(stack - far) < static_tolerance(far)).sum(0)
+    needed = max(2, int(np.ceil(STATIC_SHARE * len(stack))))
+    room = np.where((seen >= 2) & (returns >= np.minimum(needed, seen)), far, np.float32(np.nan))
     h, w = frames.camera.shape
-    return cv2.resize(mask, (w, h), interpolation=cv2.INTER_NEAREST).astype(bool)
+    return np.asarray(cv2.resize(room, (w, h), interpolation=cv2.INTER_NEAREST))
+
+
+def static_tolerance(depth_m: Float32) -> Float32:
+    """Within this of the standing room a pixel shows the room, metres."""
+    return np.float32(STATIC_SPREAD_AT_1M) * np.maximum(depth_m, np.float32(0.5)) ** 2

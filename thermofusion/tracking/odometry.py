@@ -14,12 +14,13 @@ from ..types import Float
 from .fragments import Fragment, build_fragment
 from .frames import Frame, TrackingFrames
 from .maps import DepthMap
-from .registration import REACH_M, Partners, find_partners, register
+from .registration import REACH_M, Partners, agreement, find_partners, register
 
 REACHES_M = (0.08, 0.05, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03)
 # A second try from standing still, with a far reach: for a jerk that the last motion did not announce.
 RESCUE_REACHES_M = (0.15, 0.15, 0.12, 0.12, 0.1, 0.1, 0.08, 0.06, 0.05, 0.04, 0.03, 0.03, 0.03, 0.03)
 STEP_TOLERANCE = 2e-5  # rad and m: well below what one frame's noise allows
+MIN_AGREEMENT = 0.75  # of what both frames could see, outlines included; neighbours have 0.86 to 1
 MAX_SPEED_M_S, MAX_SPEED_DEG_S = 2.5, 180.0  # faster is no walk: a failure
 MIN_STEP_M, MIN_STEP_DEG = 0.06, 6.0
 MAX_GAP_FRAMES = 5  # empty frames that a segment may step over
@@ -78,7 +79,8 @@ class GrowingSegment:
         for start, reaches in ((se3_exp(self._velocity * dt_s), REACHES_M), (np.eye(4), RESCUE_REACHES_M)):
             T_last_now, _ = register(frame.map, [(self._last.map, np.eye(4))], start, reaches, tolerance=STEP_TOLERANCE)
             partners = find_partners(frame.map, self._last.map, T_last_now, REACH_M)
-            if _believed(partners, self._recipe.tracking) and _possible(T_last_now, dt_s):
+            believed = _believed(partners, self._recipe.tracking) and _possible(T_last_now, dt_s)
+            if believed and agreement(frame.map, self._last.map, T_last_now, stride=2) >= MIN_AGREEMENT:
                 self._append(frame, self._T[-1] @ T_last_now, partners.share, partners.residual_mm_at_1m)
                 self._velocity = se3_log(T_last_now) / dt_s
                 return True

@@ -68,13 +68,7 @@ def find_partners(
     """Partners of the source's sample in the target image, within `reach_m` along and thrice that across."""
     R, t = T_target_source[:3, :3], T_target_source[:3, 3]
     p = source.sample[::stride] @ R.T + t
-    fx, fy, cx, cy = target.intrinsics
-    h, w = target.shape
-    z = np.maximum(p[:, 2], 1e-3)
-    u, v = p[:, 0] / z * fx + cx, p[:, 1] / z * fy + cy
-    column, row = np.rint(u), np.rint(v)
-    inside = np.flatnonzero((p[:, 2] > 0.1) & (column >= 0) & (row >= 0) & (column < w) & (row < h))
-    pixel = row[inside].astype(np.intp) * w + column[inside].astype(np.intp)
+    pixel, inside, off_px = _pixels(target, p)
     there = target.surface[pixel].astype(np.float64)
     n, d = there[:, 3:], p[inside] - there[:, :3]
     r = np.einsum("ij,ij->i", d, n)
@@ -85,9 +79,9 @@ def find_partners(
     chosen = inside[good]
     color = None
     if target.texture is not None and source.sample_intensity is not None:
-        off = np.stack([u - column, v - row], axis=1)[chosen]
         texture = target.texture[pixel[good]].astype(np.float64)
-        color = _color_rows(p[chosen], source.sample_intensity[::stride][chosen], texture, off, fx, fy)
+        own = source.sample_intensity[::stride][chosen]
+        color = _color_rows(p[chosen], own, texture, off_px[good], *target.intrinsics[:2])
     share = float(good.mean()) if len(good) else 0.0
     return Partners(Rows(p[chosen], n[good], r[good]), color, share, len(source.sample[::stride]))
 
@@ -107,21 +101,31 @@ def compare(source: DepthMap, target: DepthMap, T_target_source: Float, reach_m:
     partners = find_partners(source, target, T_target_source, reach_m, stride)
     p = source.sample[::stride] @ T_target_source[:3, :3].T + T_target_source[:3, 3]
     n = source.sample_normals[::stride] @ T_target_source[:3, :3].T
-    pixel, ahead = _pixels(target, p)
+    pixel, ahead, _ = _pixels(target, p)
     front = np.einsum("ij,ij->i", p[ahead], n[ahead]) < 0  # what turns its back is hidden by itself
     depth = target.surface[pixel[front], 2]
     empty, through = np.isnan(depth), depth > p[ahead][front, 2] + reach_m
     return Seen(len(partners), int((empty | through).sum()), len(p))
 
 
-def _pixels(target: DepthMap, p: Float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Flat pixel of each point of the target's frame that falls inside its image, and which points those are."""
+def agreement(a: DepthMap, b: DepthMap, T_b_a: Float, stride: int = 1) -> float:
+    """Share of what both views could see that agrees, outlines included; 0 where they share nothing."""
+    one, other = compare(a, b, T_b_a, REACH_M, stride), compare(b, a, invert(T_b_a), REACH_M, stride)
+    agree = one.agree + other.agree
+    return agree / max(agree + one.conflict + other.conflict, 1)
+
+
+def _pixels(target: DepthMap, p: Float) -> tuple[NDArray[np.intp], NDArray[np.intp], Float]:
+    """Flat pixel of each point of the target's frame that falls inside its image; which points those are; and how far
+    each falls from the pixel's centre, (N, 2)."""
     fx, fy, cx, cy = target.intrinsics
     h, w = target.shape
     z = np.maximum(p[:, 2], 1e-3)
-    column, row = np.rint(p[:, 0] / z * fx + cx), np.rint(p[:, 1] / z * fy + cy)
+    u, v = p[:, 0] / z * fx + cx, p[:, 1] / z * fy + cy
+    column, row = np.rint(u), np.rint(v)
     inside = np.flatnonzero((p[:, 2] > 0.1) & (column >= 0) & (row >= 0) & (column < w) & (row < h))
-    return row[inside].astype(np.intp) * w + column[inside].astype(np.intp), inside
+    pixel = row[inside].astype(np.intp) * w + column[inside].astype(np.intp)
+    return pixel, inside, np.stack([u - column, v - row], axis=1)[inside]
 
 
 def _color_rows(p: Float, intensity: Float, texture: Float, off_px: Float, fx: float, fy: float) -> Rows:
