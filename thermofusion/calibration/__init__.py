@@ -1,1 +1,28 @@
-"""System calibration: boards, three cameras on one rig, the radiometric curve, the clocks (paper section 2.3)."""
+"""System calibration: boards, three cameras on one rig, the radiometric curve, the clocks (paper section 2.3).
+
+`calibrate` goes from a folder of board pictures to a rig; the modules below it can be used by themselves.
+"""
+
+from __future__ import annotations
+
+from .board import Board
+from .boards import board_pdf, board_svg
+from .calibrate import Calibrated, calibrate
+from .report import report_html
+from .rig import Calibration, calibrate_views, predict_px
+from .rig_file import read_rig, rig_document, write_rig
+
+__all__ = [
+    "Board",
+    "Calibrated",
+    "Calibration",
+    "board_pdf",
+    "board_svg",
+    "calibrate",
+    "calibrate_views",
+    "predict_px",
+    "read_rig",
+    "report_html",
+    "rig_document",
+    "write_rig",
+]

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,12 +20,13 @@ from .detect_color import detect_color
 from .detect_thermal import is_saturated
 from .folder import CalibrationFolder, open_folder
 from .picks import read_picks_csv, read_picks_mat
-from .pictures import draw_points
+from .pictures import draw_points, to_grey
 from .rig import Calibration, calibrate_views
 from .rounds import detect_thermal_set
 from .views import BoardPoints, CalibrationSet, View
 
 MIN_SHARE_FOUND = 0.3  # of the pictures; below this the board described is not the one in view
+PICTURES_CHECKED = 3  # for a second board, and for a board of another size
 Progress = Callable[[str], None]
 
 
@@ -144,17 +146,50 @@ def detect_patches(image: NDArray, board: Board) -> BoardPoints | None:
     return detect_color(grey, board) or detect_color(255 - grey, board)
 
 
+def _without_board(image: NDArray, points: BoardPoints) -> NDArray:
+    """The picture with the board found covered by its own mean."""
+    out = image.copy()
+    hull = cv2.convexHull(points.px.astype(np.float32))[:, 0]
+    center = hull.mean(0)
+    mask = np.zeros(image.shape[:2], np.uint8)
+    cv2.fillConvexPoly(mask, np.round(center + 1.35 * (hull - center)).astype(np.int32), 1)
+    out[mask > 0] = image[mask > 0].mean()
+    return out
+
+
+def _other_size(folder: CalibrationFolder, camera: str) -> tuple[int, int] | None:
+    """Inner corners of the checkerboard that really is in the first pictures, if there is one."""
+    if folder.board.kind not in ("checkerboard", "pins"):
+        return None
+    for name in list(folder.files[camera])[:PICTURES_CHECKED]:
+        grey = to_grey(getattr(folder, camera)(name))
+        flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
+        found, _, meta = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), flags)
+        if found:
+            rim = 2 if folder.board.kind == "pins" else 0
+            return int(meta.shape[1]) + rim, int(meta.shape[0]) + rim
+    return None
+
+
 def _find(
     folder: CalibrationFolder, camera: str, detector: Callable[[NDArray, Board], BoardPoints | None]
 ) -> tuple[dict[str, BoardPoints], tuple[int, int]]:
-    found, shapes, saturated = {}, set(), 0
+    found: dict[str, BoardPoints] = {}
+    shapes, saturated = set(), 0
     for name in folder.files[camera]:
         image = getattr(folder, camera)(name)
         shapes.add(image.shape[:2])
         saturated += camera == "thermal" and is_saturated(image)
         points = detector(image, folder.board)
-        if points is not None:
-            found[name] = points
+        if points is None:
+            continue
+        if len(found) < PICTURES_CHECKED and detector(_without_board(image, points), folder.board) is not None:
+            raise ScanError(
+                f"two boards are in view in {camera} picture {name}",
+                place=folder.root,
+                hint="leave one board in the room, or cover the other",
+            )
+        found[name] = points
     if len(shapes) != 1:
         raise ScanError(f"the {camera} pictures differ in size", place=folder.root, hint="keep one camera to a folder")
     count = len(folder.files[camera])
@@ -165,6 +200,8 @@ def _find(
         else:
             what = f"a {board.kind} of {board.columns} x {board.rows} points"
             cause = f"{what} was found in {len(found)} of {count} {camera} pictures"
+            actual = _other_size(folder, camera)
+            cause += "" if actual is None else f", but one of {actual[0]} x {actual[1]}"
             hint = "check columns and rows (inner corners), and that the whole board, and only one, is in view"
         raise ScanError(cause, place=folder.root, hint=hint)
     h, w = shapes.pop()

@@ -13,6 +13,7 @@ from .views import DepthSamples
 CELLS = 14  # cells across the longer side of the board
 MIN_PIXELS = 200  # fewer depth pixels on a board say nothing reliable
 MIN_CELLS = 8
+FIT_PIXELS = 3000
 METRIC_NOISE = 1.5e-3  # m at 1 m, growing as range² (Kinect v1: Khoshelham & Elberink 2012 give 1.4e-3)
 QUANTUM_DISPARITY = 0.5  # counts
 CORRELATED_PIXELS = 9.0  # a structured-light camera's pixels are not independent within its matching window
@@ -67,12 +68,15 @@ def _on_plane(u: NDArray, v: NDArray, y: Float) -> tuple[Float, NDArray, float]:
     """The robust affine fit at the pixels, those within 4 sigmas of it, and that sigma [unit of y]."""
     A = np.stack([u - u.mean(), v - v.mean(), np.ones(len(u))], axis=1).astype(np.float64)
     A[:, :2] /= max(np.ptp(u), np.ptp(v), 1)
-    w, coefficients, scale = np.ones(len(y)), np.zeros(3), 1.0
-    r = y
-    for _ in range(25):
-        AtW = A.T * w
-        coefficients = np.linalg.solve(AtW @ A + 1e-12 * np.eye(3), AtW @ y)
-        r = y - A @ coefficients
+    some = slice(None, None, max(1, len(y) // FIT_PIXELS))  # a plane needs no more
+    a, b, weight = A[some], y[some], np.ones(len(y[some]))
+    coefficients: NDArray = np.zeros(3)
+    scale = 1.0
+    for _ in range(20):
+        AtW = a.T * weight
+        coefficients = np.linalg.solve(AtW @ a + 1e-12 * np.eye(3), AtW @ b)
+        r = b - a @ coefficients
         scale = 1.4826 * float(np.median(np.abs(r))) + 1e-9
-        w = 1 / (1 + (r / (2 * scale)) ** 2) ** 2
-    return y - r, np.abs(r) < 4 * scale, scale
+        weight = 1 / (1 + (r / (2 * scale)) ** 2) ** 2
+    fitted = A @ coefficients
+    return fitted, np.abs(y - fitted) < 4 * scale, scale

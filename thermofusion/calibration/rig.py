@@ -17,7 +17,7 @@ from .depth_model import DepthModel, DisparityDepth, MetricDepth
 from .depth_samples import sample_board
 from .dropouts import MARK_SIGMA_PX, agreeing, register_dropouts
 from .groups import Grouping, find_groups, misfits
-from .mirror import refuse_mirrored
+from .mirror import fits_unmirrored, refuse_mirrored, refuse_mirrored_depth, refuse_mirrored_pair
 from .single import SingleFit, fit_camera, noise_px
 from .start import board_pose, common_transform
 from .views import MIN_POINTS, CalibrationSet, View
@@ -95,6 +95,7 @@ def calibrate_views(
         raise ScanError("no camera sees the board", hint="check the board's columns and rows")
     refuse_mirrored(data)
     single = {c: fit_camera(data, c) for c in data.cameras}
+    _refuse_mirrored_pairs(single)
     grouping = _grouping(data, single)
     notes = _group_notes(grouping)
     if grouping is not None and grouping.outliers:
@@ -109,15 +110,52 @@ def calibrate_views(
         guess = np.eye(4) if T_depth_hub is None else T_depth_hub
         T, margin = guess, -0.1
         points = fit
-        for _ in range(3):  # again, knowing where the board lies in the depth image
+        if depth_kind == "metric":
+            _refuse_mirrored_depth(data, depth_images, lens, T, fit)
+        for turn in range(3):  # again, knowing where the board lies in the depth image
             seen = _with_depth(data, depth_images, lens, T, fit.board_poses(), depth_kind, margin)
             fit, extra = _add_depth(
                 points, seen, single, groups, model, depth_camera or lens, T, guess, free_spacing, depth_lens_known
             )
             lens = camera_of(fit.block("depth"), size)
             T, margin = from_rt(fit.block(f"T_depth_{fit.problem.hub}")), 0.0
+            if turn == 1 and not any(v.depth_marks for v in seen.views):
+                break
         data, more = seen, more + extra
     return _assemble(data, fit, single, grouping, model, group, (*notes, *more))
+
+
+def _refuse_mirrored_pairs(single: dict[str, SingleFit]) -> None:
+    hub, *others = single
+    for c in others:
+        refuse_mirrored_pair(hub, single[hub].poses(), c, single[c].poses())
+
+
+def _refuse_mirrored_depth(data: CalibrationSet, images: DepthImages, lens: Camera, T: Float, fit: Fit) -> None:
+    """Board normals in the depth images, as they are and if need be flipped, against the pictures' boards."""
+    poses = fit.board_poses()
+    plain = _depth_normals(_with_depth(data, images, lens, T, poses, "metric", -0.1), lens, poses)
+    if fits_unmirrored(plain):
+        return
+    flipped: DepthImages = {n: (lambda load=load: load()[:, ::-1]) for n, load in images.items()}  # type: ignore[misc]
+    refuse_mirrored_depth(
+        plain, _depth_normals(_with_depth(data, flipped, lens, T, poses, "metric", -0.1), lens, poses)
+    )
+
+
+def _depth_normals(data: CalibrationSet, lens: Camera, poses: dict[str, Float]) -> tuple[Float, Float]:
+    """(N, 3) unit normals of the boards as the pictures have them, and of planes through the depth samples."""
+    a, b, K = [], [], lens.K
+    for view in data.views:
+        if view.depth is None or view.name not in poses:
+            continue
+        d = view.depth
+        x = np.stack([(d.u_px - K[0, 2]) / K[0, 0], (d.v_px - K[1, 2]) / K[1, 1], np.ones(len(d))], axis=1)
+        points = x * d.value[:, None]
+        n = np.linalg.svd(points - points.mean(0), full_matrices=False)[2][2]
+        a.append(poses[view.name][:3, 2])
+        b.append(n * np.sign(n[2]))
+    return np.array(a).reshape(-1, 3), np.array(b).reshape(-1, 3)
 
 
 def _grouping(data: CalibrationSet, single: dict[str, SingleFit]) -> Grouping | None:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry import pixel_rays, pose, project, se3_exp
+from ..geometry import pose, project, se3_exp
 from ..types import Camera, Float
 from .board import Board
 from .cameras import rotations
@@ -111,16 +111,18 @@ def _depth_loader(rig: SimulatedRig, T: Float, noise_m: float, seed: int) -> Cal
 
 def plane_depth(rig: SimulatedRig, T_depth_board: Float, noise_m: float, seed: int) -> NDArray[np.float32]:
     """(H, W) metres: the board (0.7 spacings beyond its points) before a wall at 3 m, with range² noise; NaN never."""
-    rays = pixel_rays(rig.depth)
-    rays = rays / rays[..., 2:]
-    n, p = T_depth_board[:3, 2], T_depth_board[:3, 3]
-    z = (n @ p) / (rays @ n)
-    X = (rays * z[..., None] - p) @ T_depth_board[:3, :3]
+    K = rig.depth.K.astype(np.float32)
+    x = (np.arange(rig.depth.width_px, dtype=np.float32) - K[0, 2]) / K[0, 0]
+    y = ((np.arange(rig.depth.height_px, dtype=np.float32) - K[1, 2]) / K[1, 1])[:, None]
+    R, p = T_depth_board[:3, :3], T_depth_board[:3, 3]
+    n = R[:, 2]
+    z = np.float32(n @ p) / (np.float32(n[0]) * x + np.float32(n[1]) * y + np.float32(n[2]))
+    across, down = ((R[0, k] * x + R[1, k] * y + R[2, k]) * z - R[:, k] @ p for k in (0, 1))
     w, h = rig.board.extent_m
     m = 0.7 * rig.board.spacing_m
-    on = (X[..., 0] > -m) & (X[..., 0] < w + m) & (X[..., 1] > -m) & (X[..., 1] < h + m) & (z > 0)
-    z = np.where(on, z, 3.0)
-    return (z + np.random.default_rng(seed).normal(0, noise_m, z.shape) * z**2).astype(np.float32)
+    on = (across > -m) & (across < w + m) & (down > -m) & (down < h + m) & (z > 0)
+    z = np.where(on, z, np.float32(3.0)).astype(np.float32)
+    return z + np.random.default_rng(seed).standard_normal(z.shape, np.float32) * np.float32(noise_m) * z**2
 
 
 def thermal_picture(
