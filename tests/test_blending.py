@@ -14,7 +14,14 @@ from thermofusion.emissivity import Blackbody, Fresnel
 from thermofusion.radiometry import ZERO_DEGC_K, apparent_radiance, paper_chain
 from thermofusion.recipe import RadiometrySection
 from thermofusion.types import Observations
-from thermofusion.uncertainty import BILINEAR_VARIANCE, AngleTables, ErrorModel, covariance_modes, observation_variance
+from thermofusion.uncertainty import (
+    BILINEAR_VARIANCE,
+    AngleTables,
+    ErrorModel,
+    covariance_modes,
+    observation_variance,
+    silhouette_share,
+)
 
 MODEL = Fresnel(1.33)
 
@@ -197,6 +204,17 @@ def test_parts_of_the_variance():
     assert sigma(sigma_reflected_K=1.0) == pytest.approx(0.9 * (1 - E), rel=1e-4)
     on_skin_m = 0.5 * 2.0 / 500 / 0.5  # half a pixel at 2 m, f = 500 px, under 60°
     assert sigma(sigma_registration_px=0.5, gradient_K_per_m=10.0) == pytest.approx(10 * 0.9 * on_skin_m, rel=1e-4)
+
+
+def test_silhouettes_cost_what_the_budget_says():
+    """766/161/21/2/0.1 mK at 1/1.5/2/2.5/3 px for 10 K of contrast and a point spread of 0.7 px."""
+    share = silhouette_share(np.array([1, 1.5, 2, 2.5, 3, 32.0]), ErrorModel(edge_margin_px=0.0))
+    np.testing.assert_allclose(10 * share, [0.766, 0.161, 0.021, 0.0018, 0.0001, 0], atol=6e-4)
+    near = replace(THREE, edge_px=np.array([1.6, 32, 32], np.float32))
+    tables = AngleTables.of(MODEL)
+    far_var, near_var = (observation_variance(o, 10.0, tables, EXACT, 0.9) for o in (THREE, near))
+    assert near_var[0] > 10 * far_var[0]
+    np.testing.assert_array_equal(near_var[1:], far_var[1:])
 
 
 def test_total_is_the_sum_of_its_parts_and_modes_keep_the_covariance():

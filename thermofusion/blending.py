@@ -27,6 +27,7 @@ from .uncertainty import (
     Uncertainty,
     observation_variance,
     registration_m,
+    silhouette_share,
     skin_slope,
     vertex_uncertainty,
 )
@@ -335,10 +336,11 @@ def _levers(rows: Observations, mean: RobustMean, x: Float, task: _Task, errors:
     groups, one = mean.groups, np.ones(len(rows), np.float32)
     h = (mean.robust * mean.E / groups.rows(mean.denominator(mean.robust))).astype(np.float32)
     slope = task.tables.slope(rows.cos_angle) if task.angle_corrected else 0 * one
-    block = np.stack([one, (1 - mean.E).astype(np.float32), slope, registration_m(rows, errors)], axis=1)
+    loss, mixed = (1 - mean.E).astype(np.float32), silhouette_share(rows.edge_px, errors)
+    block = np.stack([one, loss, slope, registration_m(rows, errors), mixed], axis=1)
     sums = groups.weighted_sums(h, block)
     squares = groups.weighted_sums(h * h, np.stack([one, slope * slope], axis=1))
     modes = np.zeros((len(groups), 0))
     if task.calibration:
         modes = groups.weighted_sums(h, task.calibration.error_modes(MODES)(rows, groups.rows(x.astype(np.float32))))
-    return Levers(squares[:, 0], sums[:, 0], sums[:, 1], sums[:, 2], squares[:, 1], sums[:, 3], modes)
+    return Levers(squares[:, 0], sums[:, 0], sums[:, 1], sums[:, 2], squares[:, 1], sums[:, 3], sums[:, 4], modes)

@@ -145,7 +145,9 @@ class RadiometrySection(_Section):
     sigma_normal_deg: float | None = Field(
         None, ge=0, description="of surface normals; None = estimated from depth noise and window"
     )
-    sigma_registration_px: float = Field(0.5, ge=0, description="of the thermal image on the mesh")
+    sigma_registration_px: float = Field(
+        0.3, ge=0, description="of the thermal image on the mesh; an aligned rig leaves 0.15-0.3"
+    )
     sigma_emissivity0: float = Field(0.01, ge=0, description="of ε(0): enters the absolute level")
     sigma_shape: float = Field(0.15, ge=0, description="relative uncertainty of 1-ε(θ)'s shape")
 
