@@ -451,6 +451,12 @@ def test_isothermal_phantom_is_uniform_after_correction(name, recipe, overrides,
     seen = np.isfinite(mesh.temperature_degC) & (mesh.view_angle_deg < 60)
     error = mesh.temperature_degC[seen] - np.median(mesh.temperature_degC[seen])
     assert np.percentile(np.abs(error), 95) < 0.10
+    # the object is small and in the middle, the blackbody in the corner: what the image field is there nobody saw, the
+    # level may be off by a field's size, and the result must say so
+    true_degC = np.median(np.load(tmp_path / "scan" / "truth" / "surface.npz")["temperature_degC"])
+    level_error_K = np.median(mesh.temperature_degC[seen]) - true_degC
+    assert abs(level_error_K) < 0.35
+    assert abs(level_error_K) < 2 * calibration.level_sigma_K
 
 
 def test_skin_that_sees_skin_is_not_biased(tmp_path):

@@ -30,10 +30,11 @@ from .references import BlackbodyReading, ContactReading
 from .types import Bool, Float, Float32, Observations
 from .uncertainty import AngleTables, ErrorModel, covariance_modes, observation_variance, skin_slope
 
-FIELD_HELD_K = 0.15  # a pattern of the field less certain than this is held at zero
+FIELD_HELD = 0.7  # of the prior's sigma: a pattern of the field less certain than this is held at zero
 SHAPE_HELD = 0.5  # a shape less certain than half the way between the skin presets is held
 GAIN_SPAN_K = 3.0  # references must differ by this much to carry a gain
 ROWS_PER_VERTEX = 20  # bound on the system: max_vertices x this many observations
+SUPPORT_RADIUS, SUPPORT_ROWS, SUPPORT_VIEWS = 0.1, 200, 3  # skin near a blackbody: in image widths, rows, views
 MIN_SHARED = 20  # vertices that two views must share to count as overlapping
 ERROR_RASTER = 32  # cells along each side on which the field's error is evaluated
 
@@ -119,6 +120,7 @@ def cross_calibrate(
     max_angle_deg: float = 65.0,
     blackbodies: Sequence[BlackbodyReading] = (),
     contacts: Sequence[ContactReading] = (),
+    vertices_per_patch: float = 1.0,
 ) -> CrosscalResult:
     """Solve for offsets, field, shape and gain from all vertices that two or more views saw.
 
@@ -128,6 +130,8 @@ def cross_calibrate(
     L_reflected : radiance that vertices reflect, scalar or (V,). errors : one-sigma parts that weight observations.
     settings : `offsets = false` is one offset common to all views. max_angle_deg : steeper observations do not enter.
     blackbodies : readings; they set the level together. contacts : set the level where no blackbody does.
+    vertices_per_patch : how many neighbouring vertices share their error (one window of normals, say). A million rows
+    are not a million witnesses: without it, noise is taken for a field wherever the image shows no skin.
 
     Raises ScanError if no vertex was seen by two views.
     """
@@ -135,6 +139,8 @@ def cross_calibrate(
     chosen = _choose(observations, n_vertices, settings.max_vertices, max_angle_deg, contacts)
     L_r = np.broadcast_to(np.asarray(L_reflected, np.float64), (n_vertices,))
     system = _system(chosen, n_views, emissivity, band, image_size, L_r, errors, settings, blackbodies, contacts)
+    seen = max(int((np.bincount(observations.vertex, minlength=n_vertices) >= 2).sum()), 1)
+    system = replace(system, correlated=max(1.0, vertices_per_patch * system.n_vertices / seen))
     solution = system.solve()
     reduced, held = _without_uncarried(system, solution)
     if settings.gain and not system.use_gain:
@@ -221,7 +227,14 @@ def _system(
         readings=tuple(blackbodies),
         reading_groups=tuple(r.view if settings.offsets else 0 for r in blackbodies),
         contacts=tuple(contact_rows),
+        reading_supported=tuple(_skin_near(rows, r, image_size[0]) for r in blackbodies),
     )
+
+
+def _skin_near(rows: Observations, reading: BlackbodyReading, width_px: int) -> bool:
+    """Whether skin was seen around a reading's place in the image: only there is the field known."""
+    near = np.hypot(rows.u_px - reading.u_px, rows.v_px - reading.v_px) < SUPPORT_RADIUS * width_px
+    return int(near.sum()) >= SUPPORT_ROWS and len(np.unique(rows.view[near])) >= SUPPORT_VIEWS
 
 
 def _contact_rows(
@@ -255,10 +268,12 @@ def _without_uncarried(system: OverlapSystem, solution: Solution) -> tuple[Overl
     M, K, _ = system.sizes
     held, keep, use_shape = [], system.keep, system.use_shape
     if K:
-        values, vectors = np.linalg.eigh(solution.covariance[M : M + K, M : M + K])
-        carried = np.sqrt(np.maximum(values, 0)) < FIELD_HELD_K * system.slope_L
+        # in units of what was known before: a combination of patterns that the data tell nothing of keeps a sigma of 1
+        prior = np.sqrt(1 / np.diag(system.field_prior()))
+        values, vectors = np.linalg.eigh(solution.covariance[M : M + K, M : M + K] / np.outer(prior, prior))
+        carried = np.sqrt(np.maximum(values, 0)) < FIELD_HELD
         if not carried.all():
-            keep = keep @ vectors[:, carried]
+            keep = keep @ (prior[:, None] / prior.max() * vectors[:, carried])
             held.append(f"{int((~carried).sum())} of {K} field patterns")
     if use_shape and np.sqrt(solution.covariance[M + K, M + K]) > SHAPE_HELD:
         use_shape = False

@@ -20,7 +20,8 @@ HUBER = 1.345
 HUBER_STEPS, TUKEY_STEPS = 4, 40
 CONVERGED_K = 2e-5
 OFFSET_PRIOR_K = 5.0  # spread of offsets about their mean: only matters for views that overlap with none
-FIELD_PRIOR_K = {1: 0.25, 2: 0.25, 3: 0.1, 4: 0.1}  # rms of a field pattern by polynomial order
+FIELD_PRIOR_K = {1: 0.15, 2: 0.15, 3: 0.07, 4: 0.07}  # rms of a field pattern by polynomial order; 0.1-0.3 K together
+FIELD_UNKNOWN_K = 0.3  # one sigma of the field where no skin was seen
 SHAPE_PRIOR = 2.0
 SHAPE_BOUNDS = (-2.0, 5.0)
 GAIN_PRIOR = 0.1
@@ -67,7 +68,9 @@ class OverlapSystem:
 
     x holds the camera's gain 1 + γ. columns : (N, K + 2): field patterns, D·x of the last step, L_r - pivot.
     group : (N,) the offset's index. keep : (K_all, K) combinations of the field's patterns that are solved for.
-    order, start : rows by vertex.
+    order, start : rows by vertex. reading_supported : whether skin was seen near a reading's place in the image; where
+    it was not, the field is not known and not extrapolated. correlated : how many vertices err alike (neighbours share
+    their normal, and all share rig and shape): the data's information is divided by it where it meets other knowledge.
     """
 
     vertex: Int
@@ -89,6 +92,8 @@ class OverlapSystem:
     readings: tuple[BlackbodyReading, ...]
     reading_groups: tuple[int, ...]
     contacts: tuple[ContactRow, ...]
+    reading_supported: tuple[bool, ...] = ()
+    correlated: float = 1.0
 
     @property
     def sizes(self) -> tuple[int, int, int]:
@@ -193,17 +198,23 @@ class OverlapSystem:
         level = self._level(a, c, B)
         N -= B.T @ (B / a[:, None])
         rhs -= B.T @ (c / a)
+        N /= self.correlated
+        rhs /= self.correlated
         self._add_priors(N, rhs)
         p, covariance, level_gain = constrained_minimum(N, rhs, level.row, level.target)
         p[M + K] = np.clip(p[M + K], *SHAPE_BOUNDS)
         return p, (c - B @ p) / a, covariance, N, level_gain, level.variance
 
+    def field_prior(self) -> Float:
+        """(K, K) inverse covariance of the combinations solved for, before the data."""
+        prior = np.array([(FIELD_PRIOR_K[n] * self.slope_L) ** -2 for n in self.field.orders])
+        return np.asarray(self.keep.T @ (prior[:, None] * self.keep))
+
     def _add_priors(self, N: Float, rhs: Float) -> None:
         """Weak knowledge that only matters where the overlap has none, never about the common level."""
         M, K, P = self.sizes
         N[:M, :M] += (OFFSET_PRIOR_K * self.slope_L) ** -2 * (np.eye(M) - 1 / M)
-        prior = np.array([(FIELD_PRIOR_K[n] * self.slope_L) ** -2 for n in self.field.orders])
-        N[M : M + K, M : M + K] += self.keep.T @ (prior[:, None] * self.keep)
+        N[M : M + K, M : M + K] += self.field_prior()
         N[P - 2, P - 2] += SHAPE_PRIOR**-2
         N[P - 1, P - 1] += GAIN_PRIOR**-2
         if self.readings:
@@ -219,10 +230,13 @@ class OverlapSystem:
         """Each reading with its derivative by the parameters and its weight."""
         M, K, P = self.sizes
         out = []
-        for reading, group in zip(self.readings, self.reading_groups, strict=True):
+        supported = self.reading_supported or (True,) * len(self.readings)
+        for reading, group, known in zip(self.readings, self.reading_groups, supported, strict=True):
             row = np.zeros(P)
             row[group] = 1.0
-            row[M : M + K] = (self.field.patterns(np.array([reading.u_px]), np.array([reading.v_px])) @ self.keep)[0]
+            if known:
+                at = self.field.patterns(np.array([reading.u_px]), np.array([reading.v_px]))
+                row[M : M + K] = (at @ self.keep)[0]
             row[-1] = reading.expected - self.pivot if self.use_gain else 0.0
             out.append((reading, row, 1 / (reading.sigma_measured**2 + (READING_FLOOR_K * self.slope_L) ** 2)))
         return out
@@ -231,6 +245,8 @@ class OverlapSystem:
         rows = self._reading_rows()
         w = np.array([weight for _, _, weight in rows])
         variance = 1 / w.sum() + max(r.sigma_expected for r in self.readings) ** 2
+        if self.keep.shape[1] and not all(self.reading_supported):
+            variance += (FIELD_UNKNOWN_K * self.slope_L) ** 2
         w /= w.sum()
         row = np.sum([wi * row for wi, (_, row, _) in zip(w, rows, strict=True)], axis=0)
         target = np.sum([wi * (r.measured - r.expected) for wi, r in zip(w, self.readings, strict=True)])

@@ -347,8 +347,16 @@ def _calibrate(
         max_angle_deg=recipe.mapping.max_angle_deg,
         blackbodies=seen.blackbodies,
         contacts=_contacts(scan, surface, band),
+        vertices_per_patch=_vertices_per_patch(surface, recipe.fusion.normal_window_mm / 1e3),
     )
     return calibration, calibration.messages
+
+
+def _vertices_per_patch(surface: SurfaceMesh, window_m: float) -> float:
+    """Vertices in a disc of the normals' window: they share their normal, and with it their error."""
+    a, b, c = (surface.vertices_m[surface.triangles[:, k]] for k in range(3))
+    area_m2 = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+    return float(np.pi * (window_m / 2) ** 2 * len(surface) / area_m2)
 
 
 def _mesh(
