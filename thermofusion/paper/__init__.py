@@ -74,6 +74,8 @@ def steps() -> tuple[Step, ...]:
         Step("head", _FACE, (), _head),
         Step("sideview-head", ("fig16",), (), _side_head),
         Step("sideview-torso", ("fig16",), ("torso-dev",), _side_torso),
+        Step("methods", (), (), _methods),
+        Step("methods-torso", ("methods",), ("torso-dev",), _methods_torso),
     )
 
 
@@ -87,7 +89,9 @@ def _chosen(only: Sequence[str] | None) -> tuple[Step, ...]:
     known = {name for step in every for name in (step.name, *step.figures)}
     for name in only:
         if name not in known:
-            raise RecipeError(f"there is no figure '{name}'", place="--only", hint=f"choose from {', '.join(sorted(known))}")
+            raise RecipeError(
+                f"there is no figure '{name}'", place="--only", hint=f"choose from {', '.join(sorted(known))}"
+            )
     return tuple(step for step in every if {step.name, *step.figures} & set(only))
 
 
@@ -140,6 +144,18 @@ def _side_torso(out: Path, data: Path | None) -> list[FigureReport]:
     from .scan_figures import side_view_scan
 
     return [side_view_scan(out, out / WORK, _given(data) / "torso-dev")]
+
+
+def _methods(out: Path, data: Path | None) -> list[FigureReport]:
+    from .method_figures import methods_on_phantoms
+
+    return [methods_on_phantoms(out, out / WORK)]
+
+
+def _methods_torso(out: Path, data: Path | None) -> list[FigureReport]:
+    from .method_figures import methods_on_scan
+
+    return [methods_on_scan(out, out / WORK, _given(data) / "torso-dev")]
 
 
 WORK = "work"  # sub-folder of `out` for phantom scans and results; may be deleted

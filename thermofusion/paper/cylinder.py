@@ -63,7 +63,7 @@ def read_frame(folder: Path, water_degC: int) -> Frame:
     if len(images) != 1 or images[0].shape != SHAPE:
         raise ScanError(f"expected one image of {SHAPE[1]} x {SHAPE[0]}", place=mat)
     x = (counts.astype(np.float64) - 45_000) / 10_000
-    degC = np.polyval(np.polyfit(x.ravel(), images[0].ravel(), CURVE_DEGREE), x)
+    degC = np.asarray(np.polyval(np.polyfit(x.ravel(), images[0].ravel(), CURVE_DEGREE), x), np.float64)
     return Frame(water_degC, counts, images[0], degC, float(np.sqrt(((degC - images[0]) ** 2).mean())))
 
 
@@ -90,7 +90,7 @@ def fit_outline(profile: Float, model: EmissivityModel = ALUMINIUM) -> Outline:
 
     profile : (320,) apparent in-band radiance of the columns. The model is the Fresnel decay to the limb, the room
     beside it, blurred with a Gaussian; the amplitude and the room are free on each side, so that neither a
-    lopsided cylinder nor a lopsided room moves the axis.
+    lopsided cylinder nor a lopsided room moves the axis by a tenth of a pixel.
     """
     L_room = float(BAND.radiance(ROOM_DEGC + ZERO_DEGC_K))
     columns = np.r_[:EDGE_COLUMNS, SHAPE[1] - EDGE_COLUMNS - 2 : SHAPE[1]]
@@ -111,7 +111,8 @@ def fit_outline(profile: Float, model: EmissivityModel = ALUMINIUM) -> Outline:
     start = [159.0, 151.0, 1.2, profile[30], profile[0], profile[290], profile[-1]]
     scale = [1.0, 1.0, 1.0, 0.1, 0.1, 0.1, 0.1]
     fit = least_squares(lambda p: (rendered(p) - profile)[columns], start, x_scale=scale)
-    return Outline(*(float(v) for v in fit.x[:3]), float(np.sqrt((fit.fun**2).mean())))
+    axis, radius, sigma = (float(v) for v in fit.x[:3])
+    return Outline(axis, radius, sigma, float(np.sqrt((fit.fun**2).mean())))
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,11 +6,20 @@ from pathlib import Path
 
 import numpy as np
 
-from ..emissivity import COSINE_EPSILON0, HALE_QUERRY_1973, Cosine, EmissivityModel, Fresnel, fresnel_reflectivity, water
+from ..emissivity import (
+    COSINE_EPSILON0,
+    HALE_QUERRY_1973,
+    Cosine,
+    EmissivityModel,
+    Fresnel,
+    fresnel_reflectivity,
+    water,
+)
 from ..radiometry import Band
 from ..resources import data_dir
 from ..types import Float
-from .figure import BLUE, DASHED, GREEN, INK, ORANGE, PURPLE, Axis, Band as Area, Line, Plot, Points, Polar, page
+from .figure import BLUE, DASHED, GREEN, INK, ORANGE, PURPLE, Axis, Line, Plot, Points, Polar, page
+from .figure import Band as Area
 from .report import FigureReport, Number, Writer
 
 BAND = Band(7.5, 13.5)  # of the paper's camera
@@ -50,7 +59,7 @@ def figure7(out: Path, data: Path | None = None) -> FigureReport:
     theta[-1] = 89.999
     cos = np.cos(np.radians(theta))
     models = {name: model(cos) for name, model in SKIN.items()}
-    lam, n25, k25 = HALE_QUERRY_1973.T
+    _, n25, k25 = HALE_QUERRY_1973.T
     hale = spectral_emissivity(cos, n25, k25)
     nalli = {T: spectral_emissivity(cos, *nalli_water(T)[1:]) for T in (307, 311)}
     mean = water(BAND)(cos)
@@ -70,7 +79,9 @@ def figure7(out: Path, data: Path | None = None) -> FigureReport:
             [
                 Polar("(a) polar", Axis("ε(θ)", 0, 1, 0.25), [green, *curves]),
                 Plot("(b) Cartesian", x, unit, [green, white, *curves, *extra], "sw"),
-                Plot("the same, enlarged", Axis(x.label, 0, 75, 15), near, [green, white, *curves, *close, *extra], "sw"),
+                Plot(
+                    "the same, enlarged", Axis(x.label, 0, 75, 15), near, [green, white, *curves, *close, *extra], "sw"
+                ),
                 Plot("reflectivity 1 − ε at 60° over the band", *_over_wavelength()),
             ],
             title="Fig. 7  Directional emissivity of skin",
@@ -90,7 +101,7 @@ def figure7(out: Path, data: Path | None = None) -> FigureReport:
 _NOTES = (
     "Table 1 contradicts the paper's own ε(0) = 0.98 ± 0.01: its non-dielectric n = 1.33, k = 0.25 gives 0.9688. "
     "k = 0.166 would give 0.975, k = 0.236 the lowest value stated.",
-    "The cosine model is not within the band of water's curves anywhere beyond 20°.",
+    "The cosine model is not within the band of water's curves anywhere beyond 10°.",
 )
 
 
@@ -133,8 +144,17 @@ def _numbers(published: tuple[Float, Float] | None) -> list[Number]:
         Number("ε(0) dielectric, n = 1.33", SKIN["dielectric"].normal, "", "0.98 ± 0.01", low, high),
         # no bar: that it lies outside the paper's range is the finding
         Number("ε(0) non-dielectric, 1.33 + 0.25i", SKIN["non-dielectric"].normal, "", "0.98 ± 0.01"),
-        Number("ε(60°) dielectric (golden value 0.94087440)", float(SKIN["dielectric"](0.5)), "", None, 0.940874, 0.940875),
-        Number("ε(60°) non-dielectric (golden 0.91732224)", float(SKIN["non-dielectric"](0.5)), "", None, 0.917322, 0.917323),
+        Number(
+            "ε(60°) dielectric (golden value 0.94087440)", float(SKIN["dielectric"](0.5)), "", None, 0.940874, 0.940875
+        ),
+        Number(
+            "ε(60°) non-dielectric (golden 0.91732224)",
+            float(SKIN["non-dielectric"](0.5)),
+            "",
+            None,
+            0.917322,
+            0.917323,
+        ),
         Number("ε(60°) water, band mean (golden 0.95016)", float(water(BAND)(0.5)), "", None, 0.95015, 0.95017),
     ]
     agrees = {"dielectric": "agrees well with water", "non-dielectric": "agrees well with water", "cosine": "differs"}

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from .. import palettes
 from ..phantom import SceneConfig, load_scene, simulate
@@ -19,8 +19,8 @@ from ..raycasts import Cast, cast_views
 from ..recipe import load_recipe
 from ..scans import open_scan
 from ..types import Float, Scan, UInt8
-from .emissivity_figures import LABEL, SKIN, STYLE
-from .figure import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, Axis, Bar, Line, Picture, Plot, Points, page
+from .emissivity_figures import SKIN
+from .figure import BLUE, GREY, ORANGE, Axis, Bar, Line, Picture, Plot, Points, page
 from .report import FigureReport, Number, Writer
 from .singleview import BackProjection, View, flat_field, smoothed, view_of
 
@@ -75,7 +75,7 @@ def face_figures(out: Path, data: Path) -> list[FigureReport]:
     """Figs. 11-16 of the paper's own face. Raises ScanError where the recording is unusable."""
     scan = open_scan(data / "jhu" / "face")
     wall = (slice(0, 140), np.r_[0:190, 450:632])
-    flat, shift = flat_field(scan, data / "jhu" / "radiometry", wall, ROOM_DEGC)  # type: ignore[arg-type]
+    flat, shift = flat_field(scan, data / "jhu" / "radiometry", wall, ROOM_DEGC)
     return _figures(out, Sitting.of(Sitter("-face", "the paper's face", 112, 168, shift), smoothed(flat)))
 
 
@@ -112,15 +112,16 @@ def _figure11(out: Path, s: Sitting) -> FigureReport:
     empty = np.full((*v.camera.shape, 3), 255, np.uint8)
     shape = np.full(len(v.surface), 1.0, np.float32)
     grey = Scale("grey", 0.0, 1.1, "", "", shading=1.0)
-    image = _thermal_picture(s, scale)
+    room = replace(scale, lo=ROOM_DEGC - 3)
+    image = _thermal_picture(s, room)
     writer = Writer(out, f"fig11{s.sitter.suffix}")
     writer.svg(
         page(
             [
                 Picture("(a) surface", s.drawn("front", shape, grey)),
-                Picture("(b) thermal image", image, _bar(scale)),
+                Picture("(b) thermal image", image, _bar(room)),
                 Picture("(c) surface grid in thermal pixels", empty, None, [grid]),
-                Picture("(d) overlay", image, _bar(scale), [grid]),
+                Picture("(d) overlay", image, _bar(room), [grid]),
             ],
             title=f"Fig. 11  Surface and thermal image: {s.sitter.title}",
         )
@@ -142,7 +143,9 @@ def _figure12(out: Path, s: Sitting) -> FigureReport:
     scale = _temperature(s)
     views = ("front", "left", "right")
     writer = Writer(out, f"fig12{s.sitter.suffix}")
-    panels = [Picture(f"{name}, uncorrected", s.drawn(name, s.view.apparent_degC, scale), _bar(scale)) for name in views]
+    panels = [
+        Picture(f"{name}, uncorrected", s.drawn(name, s.view.apparent_degC, scale), _bar(scale)) for name in views
+    ]
     writer.svg(page(panels, columns=3, title=f"Fig. 12  Raw 3D thermal map: {s.sitter.title}"))
     writer.csv(_by_angle(s.view, {"apparent_degC": s.view.apparent_degC}))
     return writer.report("Raw 3D thermal map")
@@ -194,7 +197,12 @@ def _figure14(out: Path, s: Sitting) -> FigureReport:
     said = {"dielectric": "effective", "non-dielectric": "slightly stronger", "cosine": "over-compensated"}
     oblique = v.angle_deg() > 50
     numbers = [
-        Number(f"mean change beyond 50°, {name}", float(np.nanmean((maps[name] - v.apparent_degC)[oblique])), "K", said[name])
+        Number(
+            f"mean change beyond 50°, {name}",
+            float(np.nanmean((maps[name] - v.apparent_degC)[oblique])),
+            "K",
+            said[name],
+        )
         for name in SKIN
     ]
     facing_spread = _p95_p5(v.apparent_degC)
@@ -219,8 +227,9 @@ def _figure15(out: Path, s: Sitting) -> FigureReport:
     u = np.arange(v.camera.width_px, dtype=np.float64)
     x = Axis("thermal image column [px]", head[1].start, head[1].stop, 50)
     for letter, (where, row) in zip("bd", lines.items(), strict=True):
-        curves = [Line(u, s.line(row, T), *_TONES[name]) for name, T in maps.items()]
-        panels.append(Plot(f"({letter}) {where}", x, _span("T [°C]", [c.y for c in curves]), curves, "sw"))
+        values = [s.line(row, T) for T in maps.values()]
+        curves = [Line(u, y, *_TONES[name]) for name, y in zip(maps, values, strict=True)]
+        panels.append(Plot(f"({letter}) {where}", x, _span("T [°C]", values), curves, "sw"))
     changes = {(w, m): s.line(row, v.linear_degC(SKIN[m]) - v.apparent_degC) for w, row in lines.items() for m in SKIN}
     marks = [
         Line(u, changes[w, m], tone[w], f"{w}, {m}", "" if m == "dielectric" else "6 3")
@@ -241,12 +250,15 @@ def _figure15(out: Path, s: Sitting) -> FigureReport:
     return writer.report("Profiles along forehead and cheeks", _line_numbers(theta, changes), _NOTES15)
 
 
-_TONES = {"uncorrected": (GREY, "uncorrected", "5 3"), "dielectric": (BLUE, "dielectric"),
-          "non-dielectric": (ORANGE, "non-dielectric", "8 3 2 3")}  # fmt: skip
+_TONES: dict[str, tuple[str, str] | tuple[str, str, str]] = {
+    "uncorrected": (GREY, "uncorrected", "5 3"),
+    "dielectric": (BLUE, "dielectric"),
+    "non-dielectric": (ORANGE, "non-dielectric", "8 3 2 3"),
+}
 _NOTES15 = (
-    "(f) is Eq. 25 alone. With the scaling of Eqs. 26-27 the correction is zero by construction where the face looks at "
-    "the camera; the paper's smallest value of 0.2 °C is what Eq. 25 gives there (ΔT = 10 K, 1 − ε = 0.02), so its "
-    "Fig. 15(f) can only be Eq. 25.",
+    "(f) is Eq. 25 alone. With the scaling of Eqs. 26-27 the correction is zero by construction where the face looks "
+    "at the camera; the paper's smallest value of 0.2 °C is what Eq. 25 gives there (ΔT = 10 K, 1 − ε = 0.02), so "
+    "its Fig. 15(f) can only be Eq. 25.",
 )
 
 
@@ -254,11 +266,17 @@ def _figure16(out: Path, s: Sitting) -> FigureReport:
     """The side view of the raw and of the corrected maps."""
     scale, v = _temperature(s), s.view
     maps = {"uncorrected": v.apparent_degC, **{m: v.paper_degC(SKIN[m]) for m in ("dielectric", "non-dielectric")}}
-    panels = [Picture(f"{name}, {side}", s.drawn(side, T, scale), _bar(scale)) for side in ("left", "right") for name, T in maps.items()]
+    panels = [
+        Picture(f"{name}, {side}", s.drawn(side, T, scale), _bar(scale))
+        for side in ("left", "right")
+        for name, T in maps.items()
+    ]
     writer = Writer(out, f"fig16{s.sitter.suffix}")
     writer.svg(page(panels, columns=3, title=f"Fig. 16  Side views: {s.sitter.title}"))
     writer.csv(_by_angle(v, maps))
-    note = "One view can only be looked at; `fig16` of the multi-view scans compares with the view that faces the cheek."
+    note = (
+        "One view can only be looked at; `fig16` of the multi-view scans compares with the view that faces the cheek."
+    )
     return writer.report("Side views of one frontal view", (), [note])
 
 
@@ -285,7 +303,9 @@ def _line_numbers(theta: dict[str, Float], changes: dict[tuple[str, str], Float]
         ratio = changes[where, "cosine"] / changes[where, "dielectric"]
         at = np.isfinite(ratio) & (np.abs(theta[where] - 45) < 5)
         value = float(np.median(ratio[at])) if at.any() else float("nan")
-        numbers.append(Number(f"cosine's correction over dielectric's at 40-50°, {where}", value, "x", "over-compensated", 5))
+        numbers.append(
+            Number(f"cosine's correction over dielectric's at 40-50°, {where}", value, "x", "over-compensated", 5)
+        )
         numbers.append(Number(f"largest viewing angle along the {where}", float(np.nanmax(theta[where])), "°"))
     return numbers
 
@@ -333,7 +353,7 @@ def _bar(scale: Scale) -> Bar:
     return Bar(scale.palette, scale.lo, scale.hi, scale.unit)
 
 
-def _span(label: str, curves: list[ArrayLike]) -> Axis:
+def _span(label: str, curves: list[Float]) -> Axis:
     """An axis that holds the curves, with room for a legend below."""
     lo, hi = float(np.nanmin(curves)), float(np.nanmax(curves))
     return Axis(label, np.floor(lo - 0.35 * (hi - lo)), np.ceil(hi), 1.0)

@@ -6,7 +6,7 @@ Text in, text out: the same data give the same bytes. Colours stay apart for col
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Literal
@@ -146,9 +146,7 @@ class Plot:
             else:
                 parts.append(_mark(mark, at))
         parts.append("</g>")
-        parts.append(
-            f'<rect x="{_LEFT}" y="{_TOP}" width="{w:.1f}" height="{h:.1f}" fill="none" stroke="#555" stroke-width="1"/>'
-        )
+        parts.append(f'<rect x="{_LEFT}" y="{_TOP}" width="{w:.1f}" height="{h:.1f}" fill="none" stroke="#555"/>')
         parts.append(_text(_LEFT + w / 2, height - 10, self.x.label, anchor="middle", size=12))
         middle = _TOP + h / 2
         parts.append(_text(15, middle, self.y.label, anchor="middle", size=12, turn=f"rotate(-90 15 {middle:.1f})"))
@@ -270,7 +268,7 @@ def page(
     return "\n".join([*parts, "</svg>\n"])
 
 
-def csv_text(columns: dict[str, ArrayLike], digits: int = 6) -> str:
+def csv_text(columns: Mapping[str, ArrayLike], digits: int = 6) -> str:
     """Columns of equal length as CSV with a head; NaN is an empty cell."""
     values = [np.asarray(v) for v in columns.values()]
     if len({len(v) for v in values}) > 1:
@@ -288,8 +286,7 @@ def csv_text(columns: dict[str, ArrayLike], digits: int = 6) -> str:
 # ---------------------------------------------------------------- elements
 
 
-def _mark(mark: Line | Band | Points, at: object) -> str:
-    assert callable(at)
+def _mark(mark: Line | Band | Points, at: Callable[[ArrayLike, ArrayLike], tuple[NDArray, NDArray]]) -> str:
     if isinstance(mark, Line):
         d = _path(*at(mark.x, mark.y))
         dash = f' stroke-dasharray="{mark.dash}"' if mark.dash else ""
@@ -303,17 +300,19 @@ def _mark(mark: Line | Band | Points, at: object) -> str:
     px, py = at(mark.x, mark.y)
     error = np.full(np.shape(px), np.nan) if mark.error is None else np.asarray(mark.error, np.float64)
     up, down = at(mark.x, np.asarray(mark.y) + error)[1], at(mark.x, np.asarray(mark.y) - error)[1]
-    fill = "#ffffff" if mark.hollow else mark.color
     parts = []
     for x, y, y0, y1 in zip(px, py, up, down, strict=True):
         if not np.isfinite(y):
             continue
         if np.isfinite(y0):
             parts.append(_segment(x, y0, x, y1, mark.color))
-        parts.append(
-            f'<circle cx="{x:.2f}" cy="{y:.2f}" r="{mark.radius:g}" fill="{fill}" stroke="{mark.color}" stroke-width="1.3"/>'
-        )
+        parts.append(_dot(x, y, mark))
     return "".join(parts)
+
+
+def _dot(x: float, y: float, mark: Points) -> str:
+    fill = "#ffffff" if mark.hollow else mark.color
+    return f'<circle cx="{x:.2f}" cy="{y:.2f}" r="{mark.radius:g}" fill="{fill}" stroke="{mark.color}"/>'
 
 
 def _path(x: NDArray, y: NDArray) -> str:
@@ -361,9 +360,8 @@ def _legend(marks: Iterable[Mark], corner: Corner, left: float, top: float, w: f
     for i, m in enumerate(entries):
         my = y + 17 + 18 * i - 4
         if isinstance(m, Band):
-            parts.append(
-                f'<rect x="{x + 8:.1f}" y="{my - 5:.1f}" width="24" height="10" fill="{m.color}" fill-opacity="{m.opacity:g}"/>'
-            )
+            at = f'x="{x + 8:.1f}" y="{my - 5:.1f}"'
+            parts.append(f'<rect {at} width="24" height="10" fill="{m.color}" fill-opacity="{m.opacity:g}"/>')
         elif isinstance(m, Line):
             dash = f' stroke-dasharray="{m.dash}"' if m.dash else ""
             parts.append(
@@ -371,10 +369,7 @@ def _legend(marks: Iterable[Mark], corner: Corner, left: float, top: float, w: f
                 f' stroke-width="{m.width:g}"{dash}/>'
             )
         else:
-            fill = "#ffffff" if m.hollow else m.color
-            parts.append(
-                f'<circle cx="{x + 20:.1f}" cy="{my:.1f}" r="{m.radius:g}" fill="{fill}" stroke="{m.color}" stroke-width="1.3"/>'
-            )
+            parts.append(_dot(x + 20, my, m))
         parts.append(_text(x + 38, my + 4, m.label, size=12))
     return "".join(parts)
 

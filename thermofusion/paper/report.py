@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
@@ -136,7 +136,7 @@ class Writer:
         """Write STEM[SUFFIX].svg."""
         self._write(f"{self.stem}{suffix}.svg", text)
 
-    def csv(self, columns: dict[str, ArrayLike], suffix: str = "") -> None:
+    def csv(self, columns: Mapping[str, ArrayLike], suffix: str = "") -> None:
         """Write STEM[SUFFIX].csv."""
         self._write(f"{self.stem}{suffix}.csv", csv_text(columns))
 

@@ -69,7 +69,10 @@ class ByAngle:
 
         def per_bin(x: Float) -> tuple[Float, Float]:
             median = np.array([np.median(x[i]) if len(i) >= MIN_PAIRS else np.nan for i in inside])
-            mad = [np.median(np.abs(x[i] - m)) if len(i) >= MIN_PAIRS else np.nan for i, m in zip(inside, median, strict=True)]
+            mad = [
+                np.median(np.abs(x[i] - m)) if len(i) >= MIN_PAIRS else np.nan
+                for i, m in zip(inside, median, strict=True)
+            ]
             return median, 1.4826 * np.array(mad)
 
         both = {name: per_bin(x) for name, x in differences_K.items()}
@@ -81,7 +84,9 @@ class ByAngle:
         )
 
 
-def compared(result: Result, scan: Scan, recipe: Recipe, *, given: dict[str, EmissivityModel] | None = None) -> Compared:
+def compared(
+    result: Result, scan: Scan, recipe: Recipe, *, given: dict[str, EmissivityModel] | None = None
+) -> Compared:
     """A result's observations by every method, normal-equivalent throughout (what a facing camera would read).
 
     given : the models of Eqs. 25-27 and of the radiance method, named as the paper's; its skin models by default.

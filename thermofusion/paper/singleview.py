@@ -1,4 +1,4 @@
-"""One thermal view on a surface: apparent temperature and viewing angle of every vertex, correction, back-projection."""
+"""One thermal view on a surface: what each vertex looks like and at which angle, correction, back-projection."""
 
 from __future__ import annotations
 
