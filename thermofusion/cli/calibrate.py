@@ -2,8 +2,67 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Annotated
+
 import typer
+
+from ..errors import RecipeError
+from .console import emit, note
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+PICTURES_IN_REPORT = 12
 
 
 def register(app: typer.Typer) -> None:
     """Add this module's verbs."""
+    app.command()(calibrate)
+    app.command()(board)
+
+
+def calibrate(
+    folder: Annotated[Path, typer.Argument(help="Pictures of the board and a calibration.json (docs/calibration.md).")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Rig file to write.")] = Path("rig.json"),
+    picks: Annotated[Path | None, typer.Option(help="Points picked by hand: CSV or picks.mat.")] = None,
+    report: Annotated[Path | None, typer.Option(help="Report to write; beside the rig by default.")] = None,
+    json: Json = False,
+) -> None:
+    """Cameras and rig from pictures of a board: rig.json with covariances, and a report."""
+    from ..calibration import calibrate as solve
+    from ..calibration import report_html, rig_document, write_rig
+    from ..rundir import write_text
+
+    done = solve(folder, picks=picks, progress=(lambda _: None) if json else note)
+    document = rig_document(done.calibration, advice=done.advice)
+    write_rig(out, document)
+    names = [(c, v.name) for v in done.calibration.data.views for c in v.points][:PICTURES_IN_REPORT]
+    pictures = {f"{camera} {name}": done.picture(camera, name) for camera, name in names if camera != "depth"}
+    page = report or out.with_suffix(".html")
+    write_text(page, report_html(done.calibration, advice=done.advice, pictures=pictures))
+    lines = [f"{camera:<8} {n} views with the board" for camera, n in done.found.items()]
+    lines += [f"note     {text}" for text in done.calibration.notes]
+    lines += [f"next     {text}" for text in done.advice]
+    emit(document, "\n".join([*lines, f"wrote {out} and {page}"]), json)
+
+
+def board(
+    out: Annotated[Path, typer.Option("-o", "--out", help="File to write: .svg or .pdf.")] = Path("board.pdf"),
+    kind: Annotated[
+        str, typer.Option(help="checkerboard, pins, mask, circles, asymmetric-circles, charuco, lamps.")
+    ] = "checkerboard",
+    columns: Annotated[int, typer.Option(help="Points along x (a checkerboard: inner corners).")] = 9,
+    rows: Annotated[int, typer.Option(help="Points along y.")] = 6,
+    spacing_mm: Annotated[float, typer.Option("--spacing-mm", help="Distance of neighbouring points.")] = 30.0,
+    json: Json = False,
+) -> None:
+    """A board to print at 100 %, with a scale bar to check the printer."""
+    from ..calibration import Board, board_pdf, board_svg
+    from ..rundir import replacing
+
+    target = Board(kind, columns, rows, spacing_mm / 1e3)  # type: ignore[arg-type]
+    if out.suffix not in (".svg", ".pdf"):
+        raise RecipeError(f"a board is written as .svg or .pdf, not '{out.suffix}'", place=out)
+    data = board_pdf(target) if out.suffix == ".pdf" else board_svg(target).encode()
+    with replacing(out) as temporary:
+        temporary.write_bytes(data)
+    emit({"board": out, "kind": kind}, f"wrote {out}; print it at 100 % and measure the scale bar", json)
