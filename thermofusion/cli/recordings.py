@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from ..errors import RecipeError
 from .console import emit
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
@@ -23,14 +24,23 @@ def import_(
     recording: Annotated[Path, typer.Argument(help="A foreign recording.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="Scan folder to write.")],
     format: Annotated[str | None, typer.Option(help="Format of the recording; recognised by default.")] = None,
+    thermal: Annotated[Path | None, typer.Option(help="FLIR JPEG or SEQ file(s) to add as thermal frames.")] = None,
+    rig: Annotated[Path | None, typer.Option(help="rig.json with the cameras; needed with --thermal.")] = None,
     overwrite: Force = False,
     json: Json = False,
 ) -> None:
     """Write a foreign recording in the native scan form."""
-    from ..scans import open_scan
+    from ..scans import open_scan, with_rig, with_thermal
+    from ..scans.flir import read_thermal_frames
     from ..scans.write import write_scan
 
     scan = open_scan(recording, format=format)
+    if thermal is not None and rig is None:
+        raise RecipeError("--thermal needs --rig: where the thermal camera sits", hint="see `thermofusion calibrate`")
+    if thermal is not None and rig is not None:
+        scan = with_thermal(scan, read_thermal_frames(thermal), rig)
+    elif rig is not None:
+        scan = with_rig(scan, rig)
     write_scan(scan, out, overwrite=overwrite)
     streams = {name: len(s) for name in ("depth", "color", "thermal") if (s := getattr(scan, name)) is not None}
     counts = ", ".join(f"{n} {name}" for name, n in streams.items())
