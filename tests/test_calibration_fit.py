@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from thermofusion.calibration.board import Board
-from thermofusion.calibration.bundle import Options, Problem, solve
+from thermofusion.calibration.bundle import Options, Problem
 from thermofusion.calibration.cameras import (
     from_rt,
     intrinsics_of,
@@ -26,6 +26,7 @@ from thermofusion.calibration.rig import calibrate_views, predict_px
 from thermofusion.calibration.rig_file import read_rig, rig_document, write_rig
 from thermofusion.calibration.simulate import Noise, SimulatedRig, mirrored, simulate_set, true_pixels
 from thermofusion.calibration.single import fit_camera
+from thermofusion.calibration.solver import solve
 from thermofusion.calibration.views import BoardPoints, CalibrationSet, View
 from thermofusion.errors import ScanError
 from thermofusion.geometry import invert, rotation_angle_deg, se3_exp

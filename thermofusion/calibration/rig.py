@@ -2,42 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import ScanError
 from ..geometry import invert
 from ..types import Camera, Float
-from .bundle import Fit, Options, Problem, solve
-from .cameras import camera_of, from_rt, intrinsics_of, project_with_jacobian, to_rt
+from .bundle import Options, Problem
+from .cameras import camera_of, from_rt, project_with_jacobian, to_rt
+from .depth_fit import DepthImages, check_depth_orientation, default_depth_camera, fit_with_depth, with_depth
 from .depth_model import DepthModel, DisparityDepth, MetricDepth
-from .depth_samples import sample_board
-from .dropouts import MARK_SIGMA_PX, agreeing, register_dropouts
 from .groups import Grouping, find_groups, misfits
-from .mirror import fits_unmirrored, refuse_mirrored, refuse_mirrored_depth, refuse_mirrored_pair
-from .single import SingleFit, fit_camera, noise_px
-from .start import board_pose, common_transform
-from .views import MIN_POINTS, CalibrationSet, View
-
-FOCAL_PRIOR = 0.01  # one sigma of a joint focal length about the camera's own fit
-CENTER_PRIOR = 0.01  # of the principal point, image widths
-FOCAL_LIMIT = 0.03  # a joint fit that leaves this is not believed
-DEPTH_FOCAL_PRIOR = 0.01  # of a depth camera's focal length about its data sheet
-DEPTH_CENTER_PRIOR = 0.01  # of its principal point, image widths
-DEPTH_PLACE_M = (
-    0.1,
-    0.1,
-    0.015,
-)  # of the depth camera's place about the guess, hub axes: pupils on one frame stand side
-# by side, not behind each other; boards alone trade that distance against the depth scale
-PLANE_FLOOR = 1e-4  # m at 1 m: no depth camera is truer than this over a whole plane, however many pixels it averages
-MIN_MARKED_VIEWS = 4
-KINECT_FOCAL = 585.0 / 640.0  # image widths; structured-light and many time-of-flight cameras lie near it
-
-DepthImages = Mapping[str, Callable[[], NDArray]]
+from .joint import fit_jointly, initial_guess
+from .mirror import refuse_mirrored, refuse_mirrored_pair
+from .single import SingleFit, fit_camera
+from .solver import Fit, solve
+from .start import board_pose
+from .views import CalibrationSet, View
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,20 +83,20 @@ def calibrate_views(
     if grouping is not None and grouping.outliers:
         data = replace(data, views=tuple(_without(v, grouping) for v in data.views))
     groups = None if grouping is None else _spread(grouping, [v.name for v in data.views])
-    fit, more = _joint(data, single, groups)
+    fit, more = fit_jointly(data, single, groups)
     model: DepthModel | None = None
     if depth_images:
-        lens = depth_camera or _default_depth_camera(depth_images)
+        lens = depth_camera or default_depth_camera(depth_images)
         size = (lens.width_px, lens.height_px)
         model = DisparityDepth(size) if depth_kind == "disparity" else MetricDepth(size)
         guess = np.eye(4) if T_depth_hub is None else T_depth_hub
         T, margin = guess, -0.1
         points = fit
         if depth_kind == "metric":
-            _refuse_mirrored_depth(data, depth_images, lens, T, fit)
+            check_depth_orientation(data, depth_images, lens, T, fit)
         for turn in range(3):  # again, knowing where the board lies in the depth image
-            seen = _with_depth(data, depth_images, lens, T, fit.board_poses(), depth_kind, margin)
-            fit, extra = _add_depth(
+            seen = with_depth(data, depth_images, lens, T, fit.board_poses(), depth_kind, margin)
+            fit, extra = fit_with_depth(
                 points, seen, single, groups, model, depth_camera or lens, T, guess, free_spacing, depth_lens_known
             )
             lens = camera_of(fit.block("depth"), size)
@@ -131,33 +113,6 @@ def _refuse_mirrored_pairs(single: dict[str, SingleFit]) -> None:
         refuse_mirrored_pair(hub, single[hub].poses(), c, single[c].poses())
 
 
-def _refuse_mirrored_depth(data: CalibrationSet, images: DepthImages, lens: Camera, T: Float, fit: Fit) -> None:
-    """Board normals in the depth images, as they are and if need be flipped, against the pictures' boards."""
-    poses = fit.board_poses()
-    plain = _depth_normals(_with_depth(data, images, lens, T, poses, "metric", -0.1), lens, poses)
-    if fits_unmirrored(plain):
-        return
-    flipped: DepthImages = {n: (lambda load=load: load()[:, ::-1]) for n, load in images.items()}  # type: ignore[misc]
-    refuse_mirrored_depth(
-        plain, _depth_normals(_with_depth(data, flipped, lens, T, poses, "metric", -0.1), lens, poses)
-    )
-
-
-def _depth_normals(data: CalibrationSet, lens: Camera, poses: dict[str, Float]) -> tuple[Float, Float]:
-    """(N, 3) unit normals of the boards as the pictures have them, and of planes through the depth samples."""
-    a, b, K = [], [], lens.K
-    for view in data.views:
-        if view.depth is None or view.name not in poses:
-            continue
-        d = view.depth
-        x = np.stack([(d.u_px - K[0, 2]) / K[0, 0], (d.v_px - K[1, 2]) / K[1, 1], np.ones(len(d))], axis=1)
-        points = x * d.value[:, None]
-        n = np.linalg.svd(points - points.mean(0), full_matrices=False)[2][2]
-        a.append(poses[view.name][:3, 2])
-        b.append(n * np.sign(n[2]))
-    return np.array(a).reshape(-1, 3), np.array(b).reshape(-1, 3)
-
-
 def _grouping(data: CalibrationSet, single: dict[str, SingleFit]) -> Grouping | None:
     """Runs of views: lenses from the single fits, extrinsic and board poses solved as if for one rig."""
     problem = Problem(data)
@@ -167,218 +122,6 @@ def _grouping(data: CalibrationSet, single: dict[str, SingleFit]) -> Grouping | 
     held = Options(fixed=frozenset({"spacing", *single}), sigma={c: s.sigma_px for c, s in single.items()})
     fit = solve(problem, x0, held)
     return find_groups(misfits(problem, fit.x))
-
-
-def initial_guess(problem: Problem, single: dict[str, SingleFit]) -> Float:
-    """Start of the joint fit: single lenses; poses in the hub's frame, through the extrinsic where the hub is blind."""
-    x = np.zeros(len(problem.names))
-    poses = {c: s.poses() for c, s in single.items()}
-    hub = problem.hub
-    for c, s in single.items():
-        x[problem.slices[c]] = s.intrinsics
-    T_c_hub: dict[str, Float] = {}
-    for c in problem.cameras:
-        if c == hub:
-            continue
-        both = [n for n in poses[c] if n in poses[hub]]
-        if not both:
-            raise ScanError(
-                f"no view shows the board to both the {hub} and the {c} camera",
-                hint="record the board where both cameras see it, and name the files alike",
-            )
-        for g in sorted(set(problem.group.tolist())) if c == "thermal" else [0]:
-            in_group = {v.name for v, k in zip(problem.views, problem.group, strict=True) if k == g or c != "thermal"}
-            names = [n for n in both if n in in_group] or both
-            T = np.stack([poses[c][n] @ invert(poses[hub][n]) for n in names])
-            T_c_hub[c] = common_transform(T)
-            x[problem.slices[problem.extrinsic_key(c, g)]] = to_rt(T_c_hub[c])
-    for view in problem.views:
-        seen = next(c for c in (hub, *problem.cameras) if view.name in poses.get(c, {}))
-        T = poses[seen][view.name]
-        x[problem.slices[f"view:{view.name}"]] = to_rt(T if seen == hub else invert(T_c_hub[seen]) @ T)
-    return x
-
-
-def _joint(data: CalibrationSet, single: dict[str, SingleFit], groups: dict[str, int] | None) -> tuple[Fit, list[str]]:
-    """All point cameras: three rounds, each with the noise, and the misfit of the rig itself, that the last showed."""
-    problem = Problem(data, groups=groups)
-    fixed = frozenset({"spacing"} | {f"{c}.k3" for c, s in single.items() if not s.uses_k3})
-    options = Options(
-        fixed=fixed, priors=_priors(single, problem, None), sigma={c: s.sigma_px for c, s in single.items()}
-    )
-    fit = solve(problem, initial_guess(problem, single), options)
-    for _ in range(2):
-        options = replace(options, sigma=_sigmas(fit, single))
-        fit = solve(problem, fit.x, options)
-    return _plausible(fit, single)
-
-
-def _plausible(fit: Fit, single: dict[str, SingleFit]) -> tuple[Fit, list[str]]:
-    """Lenses held at their own fits where the joint one left the limit."""
-    notes = []
-    for c, s in single.items():
-        away = float(np.abs(fit.block(c)[:2] / s.intrinsics[:2] - 1).max())
-        if away > FOCAL_LIMIT:
-            notes.append(
-                f"the joint fit pulled the {c} focal length {100 * away:.1f} % away from the camera's own: all lenses "
-                "are held at their own fits"
-            )
-    if not notes:
-        return fit, []
-    x = fit.x.copy()
-    for c, s in single.items():
-        x[fit.problem.slices[c]] = s.intrinsics
-    return solve(fit.problem, x, replace(fit.options, fixed=fit.options.fixed | set(single))), notes
-
-
-def _add_depth(
-    fit: Fit,
-    data: CalibrationSet,
-    single: dict[str, SingleFit],
-    groups: dict[str, int] | None,
-    model: DepthModel,
-    depth_camera: Camera,
-    T_depth_hub: Float,
-    T_guess: Float,
-    free_spacing: bool,
-    depth_lens_known: bool,
-) -> tuple[Fit, list[str]]:
-    """Depth planes on top of the point cameras' fit: first alone against held boards, which shows how far whole planes
-    miss; then everything together with that as their weight."""
-    size = (depth_camera.width_px, depth_camera.height_px)
-    problem = Problem(data, groups=groups, depth_model=model, depth_size=size)
-    if problem.depth is None:
-        raise ScanError(
-            "no depth image shows the board's plane",
-            hint="give a first guess of T_depth_color, or check the depth unit",
-        )
-    x = np.zeros(len(problem.names))
-    for key, s in fit.problem.slices.items():
-        x[problem.slices[key]] = fit.x[s]
-    key = f"T_depth_{problem.hub}"
-    if "depth" not in fit.problem.slices:
-        x[problem.slices["depth"]] = intrinsics_of(depth_camera)
-        x[problem.slices[key]] = to_rt(T_depth_hub)
-    x[problem.slices["depth_model"]] = model.start()
-    fixed = set(fit.options.fixed) - {"spacing"}
-    fixed |= {"depth_model"} if free_spacing else {"spacing"}
-    if depth_lens_known:
-        fixed.add("depth")
-    held = frozenset(fixed | {k for k in fit.problem.slices if k not in ("spacing", "depth", key)})
-    priors = _priors(single, problem, depth_camera)
-    if "depth" not in single:
-        place = zip("xyz", T_guess[:3, 3], DEPTH_PLACE_M, strict=True)
-        priors |= {f"{key}.t{axis}": (float(m), e) for axis, m, e in place}
-    marks = MARK_SIGMA_PX * 2.0  # four corners share one measured shift
-    options = Options(fixed=held, priors=priors, sigma={"depth": marks, **fit.options.sigma})
-    for _ in range(2):
-        alone = solve(problem, x, options)
-        x = alone.x
-        options = replace(options, sigma={**options.sigma, "depth_plane": _depth_sigma(alone, fit)})
-    joint = solve(problem, x, replace(options, fixed=frozenset(fixed)))
-    return _plausible(joint, single)
-
-
-def _priors(
-    single: dict[str, SingleFit], problem: Problem, depth_camera: Camera | None
-) -> dict[str, tuple[float, float]]:
-    """A joint fit may move a lens only as far as that camera's own pictures leave open, and a little."""
-    out: dict[str, tuple[float, float]] = {}
-    for c, s in single.items():
-        width = problem.sizes[c][0]
-        floor = np.array([FOCAL_PRIOR * s.intrinsics[0]] * 2 + [CENTER_PRIOR * width] * 2 + [0.02] * 4)
-        sigma = np.maximum(floor, 4 * s.sigmas[:8])
-        names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
-        out |= {f"{c}.{n}": (float(m), float(e)) for n, m, e in zip(names, s.intrinsics, sigma, strict=False)}
-    if depth_camera is not None and "depth" not in single:
-        k, w = intrinsics_of(depth_camera), depth_camera.width_px
-        for n, m, e in zip(
-            ("fx", "fy", "cx", "cy"), k, (DEPTH_FOCAL_PRIOR * k[0],) * 2 + (DEPTH_CENTER_PRIOR * w,) * 2, strict=False
-        ):
-            out[f"depth.{n}"] = (float(m), float(e))
-    return out
-
-
-def _sigmas(fit: Fit, single: dict[str, SingleFit]) -> dict[str, float]:
-    """Noise of each sensor in the joint fit.
-
-    What a camera misses beyond its own fit is common to all points of a view (the rig moved, the board bent), so the
-    points of a view are not independent witnesses: sigma grows by Kish's design effect sqrt(1 + (n - 1)·rho) with rho
-    the systematic share of the variance. On a rigid rig rho is 0.
-    """
-    out = {}
-    residuals = fit.residuals()
-    for c, s in single.items():
-        now, own = noise_px(fit, c, free_per_view=4.0), s.sigma_px
-        n = len(residuals[c][0]) / max(len(np.unique(residuals[c][1])), 1)
-        rho = max(0.0, 1 - (1.03 * own / now) ** 2)
-        out[c] = float(now * np.sqrt(1 + (n - 1) * rho))
-    return out
-
-
-def _depth_sigma(alone: Fit, points: Fit) -> float:
-    """Noise of a depth sample, in units of its own sigma, with the design effect of planes that miss as a whole by more
-    than the boards' own uncertainty explains."""
-    problem = alone.problem
-    assert problem.depth is not None
-    r, J, columns = problem.depth_residuals(problem.depth, alone.x)
-    view = problem.depth.view
-    scale = max(1.4826 * float(np.median(np.abs(r))), 0.05)
-    where = {n: i for i, n in enumerate(points.problem.names)}
-    known = np.array([where.get(n, -1) for n in problem.names])
-    excess = []
-    for i in np.unique(view):
-        rows = view == i
-        c = known[columns[rows][0]]
-        Jv = J[rows].mean(0) * (c >= 0)
-        var = Jv @ points.covariance[np.ix_(np.maximum(c, 0), np.maximum(c, 0))] @ Jv
-        excess.append((np.median(r[rows]) ** 2 - var) / scale**2 - 1.6 / rows.sum())
-    n = len(r) / len(excess)
-    middle = float(np.median(problem.depth.value))
-    floor = 0.0 if isinstance(problem.depth_model, DisparityDepth) else (PLANE_FLOOR * middle**2) ** 2
-    floor /= (scale * float(np.median(problem.depth.sigma))) ** 2
-    rho = float(np.clip(np.mean(np.minimum(excess, 9.0)), floor, 9.0))
-    return scale * float(np.sqrt(1 + n * rho))
-
-
-def _with_depth(
-    data: CalibrationSet,
-    images: DepthImages,
-    camera: Camera,
-    T_depth_hub: Float,
-    poses: dict[str, Float],
-    kind: str,
-    margin: float,
-) -> CalibrationSet:
-    outline = data.board.outline_m(margin)
-    views, found = [], {}
-    for view in data.views:
-        samples = None
-        if view.name in images and view.name in poses:
-            image = images[view.name]()
-            if image.shape != camera.shape:
-                raise ScanError(
-                    f"the depth image is {image.shape[1]} x {image.shape[0]} px, the camera {camera.width_px} x "
-                    f"{camera.height_px}",
-                    place=view.name,
-                )
-            T_depth_board = T_depth_hub @ poses[view.name]
-            samples = sample_board(image, camera, T_depth_board, outline, disparity=kind == "disparity")
-            dropout = register_dropouts(image, camera, T_depth_board, data.board) if margin >= 0 else None
-            if dropout is not None and data.board.kind in ("pins", "checkerboard"):
-                found[view.name] = dropout
-        views.append(replace(view, depth=samples))
-    marks = agreeing(found)
-    marks = marks if len(marks) >= MIN_MARKED_VIEWS else {}
-    return replace(
-        data, views=tuple(replace(v, depth_marks=marks[v.name].marks if v.name in marks else None) for v in views)
-    )
-
-
-def _default_depth_camera(images: DepthImages) -> Camera:
-    h, w = next(iter(images.values()))().shape
-    f = KINECT_FOCAL * w
-    return Camera(w, h, np.array([[f, 0, (w - 1) / 2], [0, f, (h - 1) / 2], [0, 0, 1.0]]))
 
 
 def _without(view: View, grouping: Grouping) -> View:
@@ -479,4 +222,4 @@ def derived_extrinsics(fit: Fit, group: int) -> tuple[dict[str, Float], dict[str
     return out, cov
 
 
-__all__ = ["MIN_POINTS", "Calibration", "calibrate_views", "derived_extrinsics", "predict_px"]
+__all__ = ["Calibration", "calibrate_views", "derived_extrinsics", "predict_px"]

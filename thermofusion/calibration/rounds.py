@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import ScanError
 from ..types import Float
-from .bundle import Options, Problem, solve
+from .bundle import Options, Problem
 from .cameras import from_rt, project_with_jacobian
 from .detect_thermal import (
     SPOT_SIGMA_PX,
@@ -29,8 +29,9 @@ from .detect_thermal import (
     step_px,
 )
 from .groups import find_groups, misfits
-from .rig import initial_guess
+from .joint import initial_guess
 from .single import SingleFit, fit_camera
+from .solver import solve
 from .views import CalibrationSet
 
 SEARCH_VIEWS = 10

@@ -8,8 +8,9 @@ import numpy as np
 
 from ..errors import ScanError
 from ..types import Camera, Float
-from .bundle import Fit, Options, Problem, solve
+from .bundle import Options, Problem
 from .cameras import LensPrior, camera_of, from_rt, to_rt
+from .solver import Fit, solve
 from .start import zhang
 from .views import CalibrationSet, View
 
