@@ -105,14 +105,30 @@ def orbit(frames: int, turn_deg: float, *, distance_m: float = 1.0, seed: int = 
     return np.array(poses)
 
 
-def walk(T_body_depth: Float, *, room: tuple = (), standing: tuple = (), noise: float = 1.2e-3, seed: int = 1) -> Walk:
-    """Depth of the body, of a `room` that moves with it, and of things `standing` before the camera's own frame.
+def scaled(T: Float, factor: float) -> Float:
+    """Poses in a world of another size."""
+    out = T.copy()
+    out[:, :3, 3] *= factor
+    return out
+
+
+def walk(
+    T_body_depth: Float,
+    *,
+    shape: list | None = None,
+    room: tuple = (),
+    standing: tuple = (),
+    noise: float = 1.2e-3,
+    seed: int = 1,
+) -> Walk:
+    """Depth of the body (or another `shape`), of a `room` that moves with it, and of things `standing` in the camera's
+    own frame.
 
     noise : standard deviation at 1 m, grows with range²; depth is rounded to millimetres, as sensors do.
     """
     rng = np.random.default_rng(seed)
     scene, fixed = o3d.t.geometry.RaycastingScene(), o3d.t.geometry.RaycastingScene()
-    for mesh in (*body(), *room):
+    for mesh in (*(shape or body()), *room):
         scene.add_triangles(mesh)
     for mesh in standing:
         fixed.add_triangles(mesh)
@@ -131,3 +147,22 @@ def _cast(scene: o3d.t.geometry.RaycastingScene, T_scene_depth: Float) -> np.nda
         o3d.core.Tensor(CAMERA.K), o3d.core.Tensor(invert(T_scene_depth)), CAMERA.width_px, CAMERA.height_px
     )
     return scene.cast_rays(rays)["t_hit"].numpy().astype(np.float64)  # directions have z = 1: t is depth
+
+
+def painted_cylinder(frames: int, turn_deg: float) -> tuple[Walk, np.ndarray]:
+    """A walk round a cylinder of 30 cm, and what a colour camera in the depth camera's place saw of its paint."""
+    mesh = o3d.geometry.TriangleMesh.create_cylinder(0.15, 2.4, 200)
+    mesh.rotate(Rotation.from_euler("x", 90, degrees=True).as_matrix())
+    poses = orbit(frames, turn_deg, distance_m=0.9)
+    seen = walk(poses, shape=[o3d.t.geometry.TriangleMesh.from_legacy(mesh)])
+    v, u = np.mgrid[: CAMERA.height_px, : CAMERA.width_px]
+    rays = np.stack(
+        [(u - CAMERA.K[0, 2]) / CAMERA.K[0, 0], (v - CAMERA.K[1, 2]) / CAMERA.K[1, 1], np.ones(u.shape)], -1
+    )
+    images = []
+    for depth, T in zip(seen.depth_m, poses, strict=True):
+        p = (rays * depth[..., None]) @ T[:3, :3].T + T[:3, 3]
+        angle, height = np.arctan2(p[..., 0], p[..., 2]), p[..., 1]
+        paint = np.sin(9 * angle + 3 * np.sin(14 * height)) + np.sin(31 * height + 2 * np.cos(5 * angle))
+        images.append(np.nan_to_num(128 + 45 * paint).astype(np.uint8)[..., None].repeat(3, axis=-1))
+    return seen, np.array(images)

@@ -21,13 +21,13 @@ from .types import Bool, Camera, Float, Float32, Scan
 GRID = 80  # planes are looked for on about this many pixels of a row, and as densely along columns
 HYPOTHESES = 200
 MAX_TILT_DEG = 45.0  # of the floor's normal against the camera's up: how far a walking person pitches a camera
-FLOOR_TOLERANCE_M = 0.012  # at 1 m, grows with range²
+FLOOR_TOLERANCE_M = 0.012  # at 1 m, grows with range² beyond and shrinks with range before
 MIN_FLOOR_SHARE = 0.04  # of the valid pixels
 MAX_BELOW_SHARE = 0.02  # nothing lies below a floor
 MIN_EXTENT_M = 0.11  # rms extent of the floor's narrower direction, at 1 m and beyond: less is a lap or a shoulder
 TRACKING_CLEARANCE_M = 0.03  # at 1 m and beyond: tracking is better off without what is this near to the floor
 JUMP_AT_1M = 0.05  # depth step between neighbours (times range) that separates two things
-BEHIND_M = 0.30  # clear air between subject and background
+BEHIND_M = 0.30  # at 1 m and beyond: clear air between subject and background
 STATIC_FRAMES = 24
 STATIC_SPREAD_AT_1M = 0.012  # a pixel whose depth stays within this (times range²) shows something that does not move
 STATIC_QUANTILE = 0.85  # of a pixel's depths: its far end, without the farthest outliers
@@ -102,7 +102,7 @@ def find_floor(depth_m: Float32, rays: Float32, *, seed: int = 0) -> FloorPlane 
     if not level.any():
         return None
     n, a = n[level] / length[level, None], a[level]
-    tolerance = np.float32(FLOOR_TOLERANCE_M) * np.maximum(1, p[:, 2] ** 2)
+    tolerance = np.float32(FLOOR_TOLERANCE_M) * np.maximum(p[:, 2], p[:, 2] ** 2)
     height = p @ n.T - np.einsum("ij,ij->i", n, a)
     on = (np.abs(height) < tolerance[:, None]).sum(0)
     below = (height < -2 * tolerance[:, None]).sum(0)
@@ -139,16 +139,17 @@ def behind_subject(depth_m: Float32) -> Bool:
     weight = np.exp(-(((u - w / 2) / (w / 2)) ** 2) - 0.25 * ((v - h / 2) / (h / 2)) ** 2) / z**2
     subject = int(np.argmax(np.bincount(label, weight * z**2, n + 1) * _nearness(label, z, n)))
     far = float(np.percentile(z[label == subject], 98))
+    behind = far + BEHIND_M * min(1.0, far)
     near = np.full(n + 1, np.inf)
     np.minimum.at(near, label, z)
-    background = near > far + BEHIND_M
+    background = near > behind
     background[0] = False
     mask = background[labels].astype(np.uint8)
     if not mask.any():
         return np.zeros(depth_m.shape, bool)
     big = cv2.resize(mask, (4 * w, 4 * h), interpolation=cv2.INTER_NEAREST)[: depth_m.shape[0], : depth_m.shape[1]]
     grown = cv2.dilate(big, np.ones((5, 5), np.uint8)).astype(bool)
-    return np.asarray(grown & (depth_m > far + BEHIND_M))
+    return np.asarray(grown & (depth_m > behind))
 
 
 def _nearness(label: NDArray, z: Float32, n: int) -> Float:
@@ -183,8 +184,12 @@ def static_scene(frames: DepthFrames) -> Float32:
     )[0]
     returns = (np.abs(stack - far) < static_tolerance(far)).sum(0)
     needed = max(2, int(np.ceil(STATIC_SHARE * len(stack))))
-    room = np.where((seen >= 2) & (returns >= np.minimum(needed, seen)), far, np.float32(np.nan))
+    still = ((seen >= 2) & (returns >= np.minimum(needed, seen))).astype(np.uint8)
     h, w = frames.camera.shape
+    # the subject's own pixels come back by chance here and there; the room does over whole areas
+    size = max(3, w // 100 | 1)
+    still = cv2.morphologyEx(still, cv2.MORPH_OPEN, np.ones((size, size), np.uint8))
+    room = np.where(still > 0, far, np.float32(np.nan))
     return np.asarray(cv2.resize(room, (w, h), interpolation=cv2.INTER_NEAREST))
 
 

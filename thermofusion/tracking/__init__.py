@@ -130,6 +130,7 @@ def _from_recorded(
 ) -> list[Segment]:
     """One segment with the recorded poses."""
     T, valid = interpolate_trajectory(trajectory, scan.depth.times_s, max_gap_s=recipe.input.max_pose_gap_ms / 1e3)
+    T = _zoomed(T, frames.zoom)
     growing: GrowingSegment | None = None
     for frame in frames.read_ahead(indices[valid[indices]]):
         if frame.empty:
@@ -139,6 +140,13 @@ def _from_recorded(
         else:
             growing.append_at(frame, T[frame.index])
     return [] if growing is None else [growing.finished()]
+
+
+def _zoomed(T: Float, zoom: float) -> Float:
+    """Poses (N, 4, 4) in a world made larger."""
+    out = T.copy()
+    out[:, :3, 3] *= zoom
+    return out
 
 
 def _join(
@@ -277,6 +285,7 @@ def _result(
         s = p.segment
         T[s.frames], tracked[s.frames] = poses, True
         fitness[s.frames], residual[s.frames] = s.fitness, s.residual_mm
+    T = _zoomed(T, 1 / frames.zoom)
     if scan.trajectory is None:
         T = invert(T[int(np.argmax(tracked))]) @ T
     messages = [] if message is None else [message]

@@ -24,6 +24,7 @@ CELL_SPREAD = 0.03  # relative: pixels of one cell that differ more see two surf
 TEXTURE_WINDOW_PX = 15  # of the coarse colour image: intensity is what differs from the mean over this
 CONTRAST_FLOOR = 3.0  # grey levels of local contrast below which texture fades to nothing
 PROBES = 5
+NEAR_M = 0.7  # nearer subjects are zoomed to 1 m: they are small, and so must every distance be that matters
 SLIDES_BELOW = 0.1  # `stiffness_of` cylinders, spheres and bowls is 0.06 (what noise pretends), of bodies 0.13 to 0.35
 
 
@@ -49,8 +50,10 @@ class TrackingFrames:
 
     Attributes
     ----------
-    intrinsics : (fx, fy, cx, cy) of the coarse images. slides : the shape alone leaves some motion free, as a
-    cylinder's turn about its axis. uses_color : so texture has to help, and there is some. subject : the full frames.
+    intrinsics : (fx, fy, cx, cy) of the coarse images. subject : the full frames.
+    slides : the shape alone leaves some motion free, as a cylinder's turn about its axis. uses_color : so texture has
+    to help, and there is some.
+    zoom : depth is multiplied by it, so that a limit means the same for a toy at 30 cm as for a person at 1 m.
     """
 
     def __init__(self, scan: Scan, recipe: Recipe) -> None:
@@ -61,15 +64,20 @@ class TrackingFrames:
         # the centre of a cell of s x s pixels lies (s - 1)/2 from its first pixel's centre
         cx, cy = (K[0, 2] - (s - 1) / 2) / s, (K[1, 2] - (s - 1) / 2) / s
         self.intrinsics: Intrinsics = (K[0, 0] / s, K[1, 1] / s, cx, cy)
-        self.uses_color = False
-        self.slides = self._shape_slides()
+        self.uses_color, self.zoom = False, 1.0
+        probes = [self.load(i) for i in self._probes()]
+        near = [float(np.nanmedian(f.depth_m)) for f in probes if not f.empty]
+        if near and np.median(near) < NEAR_M:
+            self.zoom = 1 / float(np.median(near))
+        stiffness = [k for f in probes if np.isfinite(k := stiffness_of(f.map))]
+        self.slides = bool(stiffness and np.median(stiffness) < SLIDES_BELOW)
         if self.slides and recipe.tracking.color and scan.color is not None:
             self._color_of = pair_color(scan, recipe.input.pair_tolerance_ms).color_index
             self.uses_color = True
 
     def load(self, i: int) -> Frame:
         """Frame i of the depth stream."""
-        depth = coarse_depth(self.subject.load(i), self._step)
+        depth = coarse_depth(self.subject.load(i), self._step) * np.float32(self.zoom)
         intensity = self._intensity(i, depth) if self.uses_color else None
         return Frame(
             i, float(self._scan.depth.times_s[i]), depth, DepthMap.of(depth, self.intrinsics, SAMPLES, intensity)
@@ -84,11 +92,10 @@ class TrackingFrames:
         floor = self.subject.floors.get(i)
         return np.array([0.0, -1.0, 0.0]) if floor is None else floor.plane[:3]
 
-    def _shape_slides(self) -> bool:
+    def _probes(self) -> list[int]:
+        """A few usable frames, spread through the recording."""
         usable = np.flatnonzero(self._scan.depth.usable)
-        probes = usable[np.linspace(0, len(usable) - 1, min(PROBES, len(usable))).astype(int)] if len(usable) else []
-        stiffness = [s for i in probes if np.isfinite(s := stiffness_of(self.load(int(i)).map))]
-        return bool(stiffness and np.median(stiffness) < SLIDES_BELOW)
+        return usable[np.linspace(0, len(usable) - 1, min(PROBES, len(usable))).astype(int)].tolist()
 
     def _intensity(self, i: int, depth: Float32) -> Float32 | None:
         """Local contrast of the colour image at every depth pixel, about 1 in spread; NaN where there is none."""
@@ -100,7 +107,7 @@ class TrackingFrames:
         contrast = local_contrast(grey, step)
         fx, fy, cx, cy = self.intrinsics
         v, u = np.nonzero(np.isfinite(depth))
-        z = depth[v, u]
+        z = depth[v, u] / np.float32(self.zoom)
         points = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=1).astype(np.float32)
         uv, _ = project(rig.color, transform_points(rig.T_color_depth, points))
         uv = ((uv - (step - 1) / 2) / step).astype(np.float32)

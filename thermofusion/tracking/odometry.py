@@ -63,13 +63,14 @@ class GrowingSegment:
         self._source, self._recipe = frames, recipe
         self._frames: list[int] = []
         self._T: list[Float] = []
+        self._chain: list[Float] = []  # as _T, but always from frame to frame: what holds a fragment together
         self._fitness: list[float] = []
         self._residual: list[float] = []
         self._samples: list[DepthMap] = []
         self._fragments: list[Fragment] = []
         self._pending: list[Frame] = []
         self._velocity = np.zeros(6)  # twist per second
-        self._append(frame, np.eye(4) if T is None else T, np.nan, np.nan)
+        self._append(frame, np.eye(4) if T is None else T, None, np.eye(4))
 
     def take(self, frame: Frame) -> bool:
         """Append a frame if the motion to it can be believed."""
@@ -81,15 +82,20 @@ class GrowingSegment:
             partners = find_partners(frame.map, self._last.map, T_last_now, REACH_M)
             believed = _believed(partners, self._recipe.tracking) and _possible(T_last_now, dt_s)
             if believed and agreement(frame.map, self._last.map, T_last_now, stride=2) >= MIN_AGREEMENT:
-                self._append(frame, self._T[-1] @ T_last_now, partners.share, partners.residual_mm_at_1m)
+                self._append(frame, self._T[-1] @ T_last_now, partners, T_last_now)
                 self._velocity = se3_log(T_last_now) / dt_s
                 return True
         return False
 
     def append_at(self, frame: Frame, T: Float) -> None:
-        """Append a frame whose pose is known from elsewhere (a recorded trajectory)."""
-        partners = find_partners(frame.map, self._last.map, invert(self._T[-1]) @ T, REACH_M)
-        self._append(frame, T, partners.share, partners.residual_mm_at_1m)
+        """Append a frame whose pose is known from elsewhere (a recorded trajectory). Within a fragment its motion is
+        still measured: recorded poses may jitter."""
+        start, last = invert(self._T[-1]) @ T, [(self._last.map, np.eye(4))]
+        T_last_now, _ = register(frame.map, last, start, REACHES_M[1:], tolerance=STEP_TOLERANCE)
+        partners = find_partners(frame.map, self._last.map, T_last_now, REACH_M)
+        if not _believed(partners, self._recipe.tracking):
+            T_last_now = start
+        self._append(frame, T, partners, T_last_now)
 
     def finished(self) -> Segment:
         """The segment, its last frames in a last fragment."""
@@ -104,11 +110,12 @@ class GrowingSegment:
             tuple(self._fragments),
         )
 
-    def _append(self, frame: Frame, T: Float, fitness: float, residual_mm: float) -> None:
+    def _append(self, frame: Frame, T: Float, partners: Partners | None, T_last_now: Float) -> None:
         self._frames.append(frame.index)
         self._T.append(T)
-        self._fitness.append(fitness)
-        self._residual.append(residual_mm)
+        self._chain.append(self._chain[-1] @ T_last_now if self._chain else T)
+        self._fitness.append(np.nan if partners is None else partners.share)
+        self._residual.append(np.nan if partners is None else partners.residual_mm_at_1m)
         self._samples.append(frame.map.sample_only())
         self._pending.append(frame)
         self._last = frame
@@ -116,7 +123,7 @@ class GrowingSegment:
             self._close_fragment()
 
     def _close_fragment(self) -> None:
-        poses = np.array(self._T[-len(self._pending) :])
+        poses = np.array(self._chain[-len(self._pending) :])
         self._fragments.append(build_fragment(self._pending, poses, self._source.intrinsics))
         self._pending = []
 

@@ -28,7 +28,7 @@ RANSAC_ITERATIONS = 60_000
 TARGETS = 3
 SHORTLIST = 6
 MIN_SHARED = 0.2  # of the points sent: a join on less is a guess
-MIN_AGREEMENT = 0.8
+MIN_AGREEMENT = 0.85  # right places up to 50 degrees apart have 0.86 to 1, the best wrong ones up to 0.82
 MARGIN = 0.05  # by which another place must agree less
 SAME_PLACE_M, SAME_PLACE_DEG = 0.06, 8.0
 
