@@ -7,12 +7,12 @@ import pytest
 
 from thermofusion._open3d import o3d
 from thermofusion.geometry import invert, pixel_rays, pose, project, transform_points
-from thermofusion.projection import SurfaceRays, observe_view, sample_bilinear
+from thermofusion.projection import SurfaceRays, clear_of_silhouettes, observe_view, sample_bilinear
 from thermofusion.recipe import MappingSection
 from thermofusion.types import Camera, SurfaceMesh
 
 CAMERA = Camera(320, 240, np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]]), np.array([-0.2, 0.05, 0.001, 0, 0]))
-MAPPING = MappingSection(silhouette_px=3, border_px=4, last_resort_angle_deg=75)
+MAPPING = MappingSection(silhouette_px=3, border_px=4, last_resort_angle_deg=75, last_resort_silhouette_px=3)
 
 
 def sphere(center=(0.0, 0.0, 0.0), radius=0.2, resolution=90):
@@ -112,3 +112,15 @@ def test_bilinear_sampling():
     image = np.arange(12, dtype=np.float32).reshape(3, 4)
     uv = np.array([[0, 0], [1.5, 0.5], [3, 2], [3.01, 1], [-0.01, 0]])
     np.testing.assert_allclose(sample_bilinear(image, uv), [0, 3.5, 11, np.nan, np.nan])
+
+
+def test_rows_near_an_outline_count_only_where_nothing_clearer_saw_the_spot():
+    from thermofusion.types import Observations
+
+    edge_px = np.array([2.2, 5, 2.5, 9], np.float32)
+    vertex = np.array([0, 0, 1, 2], np.int32)
+    column = np.ones(4, np.float32)
+    rows = Observations(vertex, np.zeros(4, np.int32), *[column] * 6, edge_px)
+    clear, counts = clear_of_silhouettes(rows, 4, 3.0)
+    assert clear.tolist() == [False, True, False, True]
+    assert counts.tolist() == [False, True, True, True]

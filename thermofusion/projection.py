@@ -130,7 +130,7 @@ def observe_view(
     tolerance_m = mapping.visibility_tolerance_mm / 1000
     edge_px = _edge_distance(surface, camera, T_world_thermal, cos, tolerance_m)
     distance = edge_px[np.rint(uv[:, 1]).astype(np.intp), np.rint(uv[:, 0]).astype(np.intp)]
-    clear = distance >= mapping.silhouette_px
+    clear = distance >= min(mapping.last_resort_silhouette_px, mapping.silhouette_px)
     candidates, points, uv, distance = candidates[clear], points[clear], uv[clear], distance[clear]
 
     signal = sample_bilinear(radiance, uv)
@@ -148,6 +148,17 @@ def observe_view(
         v_px=uv[seen, 1].astype(np.float32),
         edge_px=distance[seen],
     )
+
+
+def clear_of_silhouettes(observations: Observations, n_vertices: int, silhouette_px: float) -> tuple[Bool, Bool]:
+    """Which rows lie clear of outlines, and which count: the clear ones, and others where a vertex has no clear one.
+
+    Returns ((N,) clear, (N,) counts).
+    """
+    clear = observations.edge_px >= np.float32(silhouette_px)
+    served = np.zeros(n_vertices, bool)
+    served[observations.vertex[clear]] = True
+    return clear, clear | ~served[observations.vertex]
 
 
 def sample_bilinear(image: NDArray, uv: NDArray) -> Float32:

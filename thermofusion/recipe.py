@@ -98,7 +98,10 @@ class FusionSection(_Section):
 class MappingSection(_Section):
     """Thermal views onto the surface."""
 
-    silhouette_px: float = Field(3.0, ge=0, description="pixels nearer to a silhouette or depth edge are rejected")
+    silhouette_px: float = Field(
+        3.0, ge=0, description="pixels nearer to a silhouette count only where nothing clearer saw the spot"
+    )
+    last_resort_silhouette_px: float = Field(2.0, ge=0, description="pixels nearer than this are never used")
     border_px: float = Field(8.0, ge=0, description="pixels nearer to the image border are rejected")
     max_angle_deg: float = Field(
         65.0, gt=0, lt=90, description="more oblique views count only where nothing better saw the spot"

@@ -20,7 +20,7 @@ from .crosscal import CrosscalResult, cross_calibrate
 from .emissivity import EmissivityModel, model_from_recipe
 from .errors import RecipeError, ScanError
 from .motion import MotionResult, view_corrections
-from .projection import SurfaceRays, observe
+from .projection import SurfaceRays, clear_of_silhouettes, observe
 from .radiometry import ZERO_DEGC_K, Band, SignalConverter
 from .recipe import RadiometrySection, Recipe
 from .references import BlackbodyReading, ContactReading, read_blackbody
@@ -50,6 +50,7 @@ DEFAULT_ROOM_DEGC = 23.0  # taken, and said, where neither scan nor recipe knows
 DEFAULT_SIGMA_NORMAL_DEG = 2.0  # of normals over a 25 mm window of a Kinect's surface
 CAVITY_FRACTION = 0.2  # of the hemisphere: beyond it reflection between body parts exceeds 0.1 K
 HIGH_RESIDUAL = 3.0  # views disagree by more than this many of their own sigmas: hair, clothes, motion
+UNCERTAINTY_MEANS = "one sigma about the common level; the level's own parts are listed apart"
 CONTACT_RADIUS_M, CONTACT_FAR_M = 0.006, 0.03
 
 
@@ -99,7 +100,8 @@ class Temperature:
     """The temperature of every vertex, how it was found, and what the other methods would have said.
 
     mesh : in the recipe's output mode. absolute_degC, normal_equivalent_degC, apparent_degC : (V,) float32.
-    body_fraction : (V,) F, or None. offsets_K : (views,) camera offsets, or None. crosscal, methods : for the report.
+    body_fraction : (V,) F, or None. level_sigma_K : one sigma of the level common to all vertices, by part; a single
+    vertex's absolute interval is √(uncertainty² + Σ level²). crosscal, methods : for the report.
     """
 
     mesh: ThermalMesh
@@ -108,6 +110,7 @@ class Temperature:
     apparent_degC: Float32
     body_fraction: Float32 | None = None
     calibration: CrosscalResult | None = None
+    level_sigma_K: dict[str, float] = field(default_factory=dict)
     crosscal: dict[str, Any] = field(default_factory=dict)
     methods: dict[str, Any] = field(default_factory=dict)
     messages: tuple[str, ...] = ()
@@ -177,6 +180,9 @@ def measure(
     observations = remove_air_path(
         seen.observations, recipe.radiometry.transmission_per_m, float(band.radiance(room.air_K))
     )
+    clear, counts = clear_of_silhouettes(observations, len(surface), recipe.mapping.silhouette_px)
+    witnesses = observations.select(clear)
+    observations = observations.select(counts)
     around = surroundings(surface) if recipe.crosscal.surroundings else None
 
     def reflected(skin: NDArray) -> float | NDArray:
@@ -186,9 +192,9 @@ def measure(
 
     L_reflected = reflected(np.full(len(surface), np.median(observations.radiance), np.float32))
     errors = _errors(scan.sensor, recipe)
-    calibration, notes = _calibrate(scan, surface, seen, observations, recipe, model, band, L_reflected, errors)
+    calibration, notes = _calibrate(scan, surface, seen, witnesses, recipe, model, band, L_reflected, errors)
 
-    def blended(settings: RadiometrySection) -> BlendResult:
+    def blended(settings: RadiometrySection, *, with_uncertainty: bool = True) -> BlendResult:
         return blend(
             observations,
             len(surface),
@@ -202,9 +208,10 @@ def measure(
             errors=errors,
             max_angle_deg=recipe.mapping.max_angle_deg,
             last_resort_angle_deg=recipe.mapping.last_resort_angle_deg,
+            with_uncertainty=with_uncertainty,
         )
 
-    result = blended(recipe.radiometry)
+    result = blended(recipe.radiometry, with_uncertainty=False)
     L_reflected = reflected(band.radiance(result.absolute_K))
     errors = replace(errors, gradient_K_per_m=surface_gradient(surface, result.absolute_K))
     result = blended(recipe.radiometry)
@@ -221,6 +228,7 @@ def measure(
         apparent_degC=_degC(result.apparent_K),
         body_fraction=body_fraction,
         calibration=calibration,
+        level_sigma_K=result.uncertainty.level_parts_K,
         crosscal={} if calibration is None else _crosscal_report(calibration, seen),
         methods=methods,
         messages=(*room.assumed, *notes),
@@ -386,7 +394,9 @@ def _mesh(
         observations=result.count,
         flags=flags,
         uncertainty_parts=result.uncertainty.parts_K,
-        metadata=_metadata(recipe, axes) | {"scan": scan.name},
+        metadata=_metadata(recipe, axes)
+        | {"scan": scan.name, "uncertainty": UNCERTAINTY_MEANS}
+        | {f"level_sigma_K_{k}": v for k, v in result.uncertainty.level_parts_K.items() if np.isfinite(v)},
     )
 
 

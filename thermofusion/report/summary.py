@@ -174,6 +174,7 @@ def _temperature(t: Temperature) -> dict[str, Any]:
         "coverage": float(ok.mean()),
         "percentiles_degC": {str(p): float(np.percentile(T[ok], p)) if ok.any() else None for p in PERCENTILES},
         "median_sigma_K": float(np.nanmedian(mesh.uncertainty_K)) if np.isfinite(mesh.uncertainty_K).any() else None,
+        "level_sigma_K": t.level_sigma_K,
         "flags": flags,
         "crosscal": t.crosscal,
         "methods": t.methods,
