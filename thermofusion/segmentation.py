@@ -25,12 +25,16 @@ FLOOR_TOLERANCE_M = 0.012  # at 1 m, grows with range² beyond and shrinks with 
 MIN_FLOOR_SHARE = 0.04  # of the valid pixels
 MAX_BELOW_SHARE = 0.02  # nothing lies below a floor
 MIN_EXTENT_M = 0.11  # rms extent of the floor's narrower direction, at 1 m and beyond: less is a lap or a shoulder
+MIN_HEIGHT = 0.15  # of the camera above the floor, as a share of the floor's distance: nobody films along a floor
 TRACKING_CLEARANCE_M = 0.03  # at 1 m and beyond: tracking is better off without what is this near to the floor
 JUMP_AT_1M = 0.05  # depth step between neighbours (times range) that separates two things
 BEHIND_M = 0.30  # at 1 m and beyond: clear air between subject and background
+BEHIND_SHARE = 0.9  # of a piece's pixels: the rest may be flying ones
+PIECES_PX = 160  # pieces are looked for on about this many pixels of a row
 STATIC_FRAMES = 24
-STATIC_SPREAD_AT_1M = 0.012  # a pixel whose depth stays within this (times range²) shows something that does not move
+STATIC_SPREAD_AT_1M = 0.01  # a pixel whose depth stays within this (times range²) shows something that does not move
 STATIC_QUANTILE = 0.85  # of a pixel's depths: its far end, without the farthest outliers
+ALWAYS_SHARE, ALWAYS_AREA = 0.8, 0.2  # a piece of room: a fifth of its pixels show it in four of five frames
 STATIC_SHARE = 0.3  # of frames in which a pixel must see the room at its far end
 
 
@@ -119,7 +123,10 @@ def find_floor(depth_m: Float32, rays: Float32, *, seed: int = 0) -> FloorPlane 
         _, s, axes = np.linalg.svd(p[inliers] - centre, full_matrices=False)
         normal = axes[2] * (-1 if axes[2, 1] > 0 else 1)
         plane, extent = np.append(normal, -(normal @ centre)).astype(np.float64), float(s[1] / np.sqrt(inliers.sum()))
-    smallest = MIN_EXTENT_M * min(1.0, float(np.median(p[inliers, 2])))
+    distance = float(np.median(p[inliers, 2]))
+    if plane[3] < MIN_HEIGHT * distance:
+        return None
+    smallest = MIN_EXTENT_M * min(1.0, distance)
     return FloorPlane(plane, float(inliers.mean())) if extent > smallest else None
 
 
@@ -129,7 +136,8 @@ def behind_subject(depth_m: Float32) -> Bool:
     The image falls into pieces at depth steps; the subject is the piece that is largest, nearness and centrality
     weighed in; pieces that begin `BEHIND_M` behind its end are background.
     """
-    small = depth_m[::4, ::4]
+    step = max(1, round(depth_m.shape[1] / PIECES_PX))
+    small = depth_m[::step, ::step]
     labels, n = _pieces(small)
     if n <= 1:
         return np.zeros(depth_m.shape, bool)
@@ -140,15 +148,15 @@ def behind_subject(depth_m: Float32) -> Bool:
     subject = int(np.argmax(np.bincount(label, weight * z**2, n + 1) * _nearness(label, z, n)))
     far = float(np.percentile(z[label == subject], 98))
     behind = far + BEHIND_M * min(1.0, far)
-    near = np.full(n + 1, np.inf)
-    np.minimum.at(near, label, z)
-    background = near > behind
-    background[0] = False
+    count = np.maximum(np.bincount(label, minlength=n + 1), 1)
+    background = np.bincount(label, z > behind, n + 1) > BEHIND_SHARE * count
     mask = background[labels].astype(np.uint8)
     if not mask.any():
         return np.zeros(depth_m.shape, bool)
-    big = cv2.resize(mask, (4 * w, 4 * h), interpolation=cv2.INTER_NEAREST)[: depth_m.shape[0], : depth_m.shape[1]]
-    grown = cv2.dilate(big, np.ones((5, 5), np.uint8)).astype(bool)
+    big = cv2.resize(mask, (step * w, step * h), interpolation=cv2.INTER_NEAREST)[
+        : depth_m.shape[0], : depth_m.shape[1]
+    ]
+    grown = cv2.dilate(big, np.ones((step + 3, step + 3), np.uint8)).astype(bool)
     return np.asarray(grown & (depth_m > behind))
 
 
@@ -184,12 +192,13 @@ def static_scene(frames: DepthFrames) -> Float32:
     )[0]
     returns = (np.abs(stack - far) < static_tolerance(far)).sum(0)
     needed = max(2, int(np.ceil(STATIC_SHARE * len(stack))))
-    still = ((seen >= 2) & (returns >= np.minimum(needed, seen))).astype(np.uint8)
+    often = (seen >= 2) & (returns >= np.minimum(needed, seen))
+    # The subject's own pixels come back by chance here and there; the room hangs together with what was always seen.
+    labels, n = _pieces(np.where(often, far, np.float32(np.nan)))
+    size = np.maximum(np.bincount(labels.ravel(), minlength=n + 1), 1)
+    always = np.bincount(labels.ravel(), (returns >= ALWAYS_SHARE * len(stack)).ravel(), n + 1) / size
+    room = np.where(often & (always > ALWAYS_AREA)[labels], far, np.float32(np.nan))
     h, w = frames.camera.shape
-    # the subject's own pixels come back by chance here and there; the room does over whole areas
-    size = max(3, w // 100 | 1)
-    still = cv2.morphologyEx(still, cv2.MORPH_OPEN, np.ones((size, size), np.uint8))
-    room = np.where(still > 0, far, np.float32(np.nan))
     return np.asarray(cv2.resize(room, (w, h), interpolation=cv2.INTER_NEAREST))
 
 
