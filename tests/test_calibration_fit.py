@@ -274,3 +274,19 @@ def test_solve_says_when_it_converged(rig):
     again = solve(s.fit.problem, s.fit.x, s.fit.options)
     assert again.converged
     np.testing.assert_allclose(again.x, s.fit.x, atol=1e-3)
+
+
+def test_intervals_hold_over_seeds(rig):
+    """The short form of benchmarks/calibration_coverage.py: lenses and thermal extrinsic, 8 seeds of 8 views."""
+    z = []
+    for seed in range(8):
+        data, _, _ = simulate_set(rig, seed, views=8, with_depth=False)
+        c = calibrate_views(data)
+        for name in ("color", "thermal"):
+            s = np.sqrt(np.diag(c.fit.block_covariance(name)))[:8]
+            z.append((c.fit.block(name) - intrinsics_of(rig.camera(name)))[:8] / s)
+        truth = rig.T_thermal_depth @ invert(rig.T_color_depth)
+        s = np.sqrt(np.diag(c.extrinsic_covariance["T_thermal_color"]))
+        z.append((to_rt(c.extrinsics["T_thermal_color"]) - to_rt(truth)) / s)
+    inside = np.mean(np.abs(np.concatenate(z)) < 1.96)
+    assert 0.88 < inside < 0.995

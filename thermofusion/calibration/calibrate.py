@@ -88,6 +88,10 @@ def calibrate(
     )
     found = {c: len(data.seen_by(c)) for c in data.cameras}
     next_steps = tuple(s for c in result.single for s in advice(coverage(result, c)))
+    burnt = [n for n in folder.files.get("thermal", {}) if n in result.views_used() and is_saturated(folder.thermal(n))]
+    if burnt:
+        text = f"{len(burnt)} thermal pictures are saturated ({', '.join(burnt[:5])}): widen the temperature range"
+        next_steps = (text, *next_steps)
     return Calibrated(folder, result, rejected, found, next_steps)
 
 

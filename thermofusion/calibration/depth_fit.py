@@ -24,7 +24,7 @@ from .views import CalibrationSet
 # One sigma of the depth camera's place about the guess, hub axes: pupils on one frame stand side by side, not behind
 # each other; boards alone trade that distance against the depth scale.
 DEPTH_PLACE_M = (0.1, 0.1, 0.015)
-PLANE_FLOOR = 1e-4  # m at 1 m: no depth camera is truer than this over a whole plane, however many pixels it averages
+PLANE_FLOOR = 5e-5  # m at 1 m: no depth camera is truer than this over a whole plane, however many pixels it averages
 MIN_MARKED_VIEWS = 4
 KINECT_FOCAL = 585.0 / 640.0  # image widths; structured-light and many time-of-flight cameras lie near it
 
@@ -112,8 +112,15 @@ def with_depth(
     poses: dict[str, Float],
     kind: str,
     margin: float,
+    scale: float = 1.0,
 ) -> CalibrationSet:
-    outline = data.board.outline_m(margin)
+    """The set with depth samples on each board, and where dropouts draw it.
+
+    poses : T_hub_board by view, metres. margin : spacings by which the board is taken larger than its points. scale :
+    of the board's nominal spacing, as found so far.
+    """
+    board = replace(data.board, spacing_m=data.board.spacing_m * scale)
+    outline = board.outline_m(margin)
     views, found = [], {}
     for view in data.views:
         samples = None
@@ -127,7 +134,7 @@ def with_depth(
                 )
             T_depth_board = T_depth_hub @ poses[view.name]
             samples = sample_board(image, camera, T_depth_board, outline, disparity=kind == "disparity")
-            dropout = register_dropouts(image, camera, T_depth_board, data.board) if margin >= 0 else None
+            dropout = register_dropouts(image, camera, T_depth_board, board) if margin >= 0 else None
             if dropout is not None and data.board.kind in ("pins", "checkerboard"):
                 found[view.name] = dropout
         views.append(replace(view, depth=samples))

@@ -95,7 +95,8 @@ def calibrate_views(
         if depth_kind == "metric":
             check_depth_orientation(data, depth_images, lens, T, fit)
         for turn in range(3):  # again, knowing where the board lies in the depth image
-            seen = with_depth(data, depth_images, lens, T, fit.board_poses(), depth_kind, margin)
+            scale = float(np.exp(fit.block("spacing")[0]))
+            seen = with_depth(data, depth_images, lens, T, fit.board_poses(), depth_kind, margin, scale)
             fit, extra = fit_with_depth(
                 points, seen, single, groups, model, depth_camera or lens, T, guess, free_spacing, depth_lens_known
             )
