@@ -250,8 +250,8 @@ def test_advice_names_the_empty_part(rig):
     empty = replace(some, counts=np.array([[0, 9, 9], [9, 9, 9], [9, 9, 9]]))
     assert any("upper left" in s for s in advice(empty))
     narrow = replace(some, tilts_deg=np.column_stack([np.full(12, 20.0), np.zeros(12)]))
-    assert any("turned left" in s for s in advice(narrow))
-    assert not any("turned right" in s for s in advice(narrow))
+    assert any("looks left" in s for s in advice(narrow))
+    assert not any("looks right" in s for s in advice(narrow))
 
 
 def test_rotation_vectors_round_trip():

@@ -18,7 +18,8 @@ MIN_DISTANCE_RATIO = 1.4
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """counts : (3, 3) points by part of the picture. tilts_deg : (V, 2) board turned right / up as seen by the camera.
+    """counts : (3, 3) points by part of the picture. tilts_deg : (V, 2) by which the board's face looks to the
+    right and up, as seen in the picture.
     distances_m : (V,) to the board's middle."""
 
     camera: str
@@ -38,7 +39,7 @@ def coverage(calibration: Calibration, camera: str) -> Coverage:
     poses = calibration.single[camera].poses()
     T = np.stack(list(poses.values()))
     n = T[:, :3, 2]
-    tilts = np.degrees(np.stack([np.arctan2(n[:, 0], n[:, 2]), -np.arctan2(n[:, 1], n[:, 2])], axis=1))
+    tilts = np.degrees(np.stack([np.arctan2(-n[:, 0], n[:, 2]), np.arctan2(n[:, 1], n[:, 2])], axis=1))
     middle = calibration.data.board.points_m.mean(0)
     return Coverage(camera, counts, tilts, np.linalg.norm(T[:, :3, :3] @ middle + T[:, :3, 3], axis=1))
 
@@ -59,7 +60,9 @@ def advice(c: Coverage) -> list[str]:
     for axis, words in enumerate((("left", "right"), ("down", "up"))):
         for sign, word in zip((-1, 1), words, strict=True):
             if (sign * c.tilts_deg[:, axis]).max() < MIN_TILT_DEG:
-                out.append(f"no board turned {word} by more than {MIN_TILT_DEG:.0f} deg before the {c.camera} camera")
+                out.append(
+                    f"no board whose face looks {word} by more than {MIN_TILT_DEG:.0f} deg before the {c.camera} camera"
+                )
     if c.distances_m.max() < MIN_DISTANCE_RATIO * c.distances_m.min():
         out.append(
             f"all boards stand {c.distances_m.min():.2f} to {c.distances_m.max():.2f} m from the {c.camera} camera: "
