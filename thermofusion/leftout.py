@@ -13,6 +13,7 @@ from .crosscal import CrosscalResult, cross_calibrate
 from .emissivity import EmissivityModel, model_from_recipe
 from .errors import ScanError
 from .errorstats import weighted_quantile
+from .projection import clear_of_silhouettes
 from .radiometry import ZERO_DEGC_K, Band
 from .recipe import Recipe
 from .references import BlackbodyReading
@@ -45,12 +46,14 @@ class LeftOut:
 class Bench:
     """Vertices of a finished result, numbered without gaps, and all that it takes to solve them again.
 
-    vertices : (V,) their numbers in the mesh. observations : of them, freed of the air path. L_reflected : (V,), and
-    errors : as the finished result has them. per_patch : vertices of the bench that share a normal's error.
+    vertices : (V,) their numbers in the mesh. observations : of them, freed of the air path, clear of outlines or the
+    best there is. counts : (N,) what the finished map is made of: a part of the views must not fall back on worse.
+    L_reflected : (V,), and errors : as the finished result has them. per_patch : vertices that share a normal's error.
     """
 
     vertices: NDArray[np.intp]
     observations: Observations
+    counts: Bool
     n_views: int
     blackbodies: tuple[BlackbodyReading, ...]
     camera: Camera
@@ -79,10 +82,16 @@ class Bench:
             L_reflected = surroundings(surface).reflected_radiance(
                 float(L_reflected[0]), band.radiance(skin_K), emissivity=model.hemispherical
             )
-        errors = error_model(scan.sensor, recipe)
+        errors, mapping = error_model(scan.sensor, recipe), recipe.mapping
+        L_air = float(band.radiance(room.air_K))
+        rows = remove_air_path(seen.observations, recipe.radiometry.transmission_per_m, L_air)
+        rows = rows.select(clear_of_silhouettes(rows, len(surface), mapping.silhouette_px)[1])
+        straight = rows.cos_angle >= np.float32(np.cos(np.radians(mapping.max_angle_deg)))
+        well_seen = np.bincount(rows.vertex[straight], minlength=len(surface)) > 0
         return cls(
             np.arange(len(surface)),
-            remove_air_path(seen.observations, recipe.radiometry.transmission_per_m, float(band.radiance(room.air_K))),
+            rows,
+            straight | ~well_seen[rows.vertex],
             len(seen.views),
             seen.blackbodies,
             scan.rig.thermal,
@@ -102,10 +111,12 @@ class Bench:
         chosen = seen[:: max(1, -(-len(seen) // size))]
         number = np.full(len(self), -1, np.int32)
         number[chosen] = np.arange(len(chosen), dtype=np.int32)
-        rows = self.observations.select(number[self.observations.vertex] >= 0)
+        mine = number[self.observations.vertex] >= 0
+        rows = self.observations.select(mine)
         return replace(
             self,
             vertices=self.vertices[chosen],
+            counts=self.counts[mine],
             observations=replace(rows, vertex=number[rows.vertex]),
             L_reflected=self.L_reflected[chosen],
             errors=replace(self.errors, gradient_K_per_m=np.asarray(self.errors.gradient_K_per_m)[chosen]),
@@ -124,8 +135,9 @@ class Bench:
         """Cross-calibration of the views of a mask (N_views,); None for methods without. Raises ScanError."""
         if self.recipe.radiometry.method != "joint":
             return None
+        clear = self.observations.edge_px >= np.float32(self.recipe.mapping.silhouette_px)
         return cross_calibrate(
-            self.observations.select(views[self.observations.view]),
+            self.observations.select(clear & views[self.observations.view]),
             len(self),
             self.n_views,
             self.emissivity,
@@ -142,7 +154,7 @@ class Bench:
     def blend(self, views: Bool, calibration: CrosscalResult | None) -> BlendResult:
         """The map from the views of a mask."""
         return blend(
-            self.observations.select(views[self.observations.view]),
+            self.observations.select(self.counts & views[self.observations.view]),
             len(self),
             calibration,
             self.emissivity,

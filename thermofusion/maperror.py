@@ -29,6 +29,7 @@ WELL_SEEN_DEG = 60.0  # the map's error is stated for surface that two views saw
 COUNT_CLASSES = (3, 4, 6, 9, 13, 19)  # lower ends of classes of views per vertex, after the first (2)
 HALVINGS = 3  # ways to cut the arcs: a weakly determined pattern differs much from one to the next
 DECLARED = ("shape", "air", "emissivity0", "reflected")  # parts of the budget that all views share
+OF_VIEWS = ("noise", "normals", "registration", "silhouette")  # parts that more views make smaller
 SAMPLING_PX2 = 1 / 6  # variance of bilinear sampling as a point spread, mean over sub-pixel positions
 REACH = 3.5  # sigmas to which the point spread is followed
 NEIGHBOURS = 12  # sampled vertices over which the squared effect of the point spread is averaged
@@ -74,10 +75,10 @@ def map_error(bench: Bench, dense: Bench, surface: SurfaceMesh, sigma_K: NDArray
 
     Raises ScanError where halves of the views cannot be compared.
     """
-    rows = bench.observations
-    limits = np.cos(np.radians([WELL_SEEN_DEG, bench.recipe.mapping.max_angle_deg])).astype(np.float32)
-    well_seen = np.bincount(rows.vertex[rows.cos_angle > limits[0]], minlength=len(bench)) >= 2
-    count = np.bincount(rows.vertex[rows.cos_angle > limits[1]], minlength=len(bench))
+    rows = bench.observations.select(bench.counts)
+    limit = np.float32(np.cos(np.radians(WELL_SEEN_DEG)))
+    well_seen = np.bincount(rows.vertex[rows.cos_angle > limit], minlength=len(bench)) >= 2
+    count = np.bincount(rows.vertex, minlength=len(bench))
     if not well_seen.any():
         raise ScanError("no spot was seen by two views under 60°")
     arc = int(np.clip(np.median(count[well_seen]) // 2, 1, len(bench.seen_views) // 2))
@@ -118,14 +119,15 @@ def _halves(bench: Bench, arc: int, shift: int) -> Halves:
     in_A[views[turn]], in_B[views[~turn]] = True, True
     calibrations = (bench.calibrate(in_A), bench.calibrate(in_B))
     a, b = (bench.blend(m, c) for m, c in zip((in_A, in_B), calibrations, strict=True))
-    s_a, s_b = (_noise(r) for r in (a, b))
+    s_a, s_b = (_own(r) for r in (a, b))
     error = (a.temperature_K - b.temperature_K) * s_a * s_b / (s_a**2 + s_b**2)
     return Halves((in_A, in_B), calibrations, np.asarray(error))
 
 
-def _noise(result: BlendResult) -> Float:
-    """(V,) one sigma of pixel noise: what the number and weight of a vertex's views make of it."""
-    return result.uncertainty.parts_K["noise"].astype(np.float64)
+def _own(result: BlendResult) -> Float:
+    """(V,) one sigma of what single views add: what the number and weight of a vertex's views make of it."""
+    parts = result.uncertainty.parts_K
+    return np.sqrt(np.sum([parts[k].astype(np.float64) ** 2 for k in OF_VIEWS if k in parts], axis=0))
 
 
 def _representing(count: NDArray, well_seen: Bool, vertex: NDArray) -> Float:
@@ -184,10 +186,9 @@ def _weighted_mean(values: NDArray, weight: NDArray, owner: NDArray, n: int) -> 
 
 def _spread_m(bench: Bench, psf_sigma_px: float) -> Float:
     """(V,) m, sigma of the point spread on the surface: optics and bilinear sampling; 1/cosθ wider along the tilt."""
-    rows = bench.observations
-    used = rows.cos_angle >= np.float32(np.cos(np.radians(bench.recipe.mapping.max_angle_deg)))
-    vertex, cos = rows.vertex[used], rows.cos_angle[used].astype(np.float64)
-    pixel_m2 = rows.footprint_m2[used] * cos
+    rows = bench.observations.select(bench.counts)
+    vertex, cos = rows.vertex, rows.cos_angle.astype(np.float64)
+    pixel_m2 = rows.footprint_m2 * cos
     area = pixel_m2 * 0.5 * (1 + 1 / cos**2)
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = np.bincount(vertex, area * cos**2, len(bench)) / np.bincount(vertex, cos**2, len(bench))

@@ -96,10 +96,11 @@ def _map_lines(m: MapError) -> list[str]:
     return [
         f"the map      expected relative error: MAE {e.mae_K:.4f} K, RMSE {e.rmse_K:.4f} K, p95 {e.p95_K:.4f} K,",
         f"             where two views saw the surface under 60°; {e.within_95:.1%} inside the stated 95 % interval",
-        f"             (rms of error over sigma {m.sigma_ratio:.2f}). Of it, RMSE: {m.random.rmse_K:.4f} K between halves",
+        f"             (rms of error over sigma {m.sigma_ratio:.2f}). Of it, RMSE: "
+        f"{m.random.rmse_K:.4f} K between halves",
         f"             of the views ({m.halvings} cuts, arcs of {m.arc_views}, {m.coverage:.0%} seen by both); "
-        f"{m.spread_rms_K:.4f} K point spread;",
-        f"             {m.declared_rms_K:.4f} K air, ε(0) and reflection, as declared",
+        f"{m.spread_rms_K:.4f} K",
+        f"             point spread; {m.declared_rms_K:.4f} K air, ε(0) and reflection, as declared",
     ]
 
 

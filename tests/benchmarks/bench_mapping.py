@@ -42,7 +42,7 @@ converter = SignalConverter(scan.sensor)
 
 start = time.monotonic()
 rays = SurfaceRays(mesh)
-observations = observe(scan, rays, views, converter.radiance, MappingSection())
+observe(scan, rays, views, converter.radiance, MappingSection())
 ours_s = time.monotonic() - start
 print(
     f"ours   {len(mesh)} vertices, {n} views: {ours_s:.2f} s, {1e3 * ours_s / n:.1f} ms a view, {len(observations)} rows"
