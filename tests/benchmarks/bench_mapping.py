@@ -44,9 +44,7 @@ start = time.monotonic()
 rays = SurfaceRays(mesh)
 observe(scan, rays, views, converter.radiance, MappingSection())
 ours_s = time.monotonic() - start
-print(
-    f"ours   {len(mesh)} vertices, {n} views: {ours_s:.2f} s, {1e3 * ours_s / n:.1f} ms a view, {len(observations)} rows"
-)
+print(f"ours   {len(mesh)} vertices, {n} views: {ours_s:.2f} s, {1e3 * ours_s / n:.1f} ms a view")
 
 if options.open3d:
     target = o3d.t.geometry.TriangleMesh(o3d.core.Tensor(mesh.vertices_m), o3d.core.Tensor(mesh.triangles))
