@@ -23,18 +23,17 @@ from ..recipe import Recipe
 from ..types import Bool, Float, Scan, Trajectory
 from .fragments import Fragment
 from .frames import TrackingFrames
-from .joint import overlapping, solve_jointly
+from .joint import LOOP_APART, overlapping, solve_jointly
 from .odometry import GrowingSegment, Segment, odometry
 from .registration import register
 from .relocalise import find_join
 
 REACHES_M = (0.08, 0.03, 0.015)  # of partners, round by round
 PARTNERS_PER_FRAGMENT = 8
-MIN_OVERLAP = 0.2
+MIN_OVERLAP = 0.2  # of a fragment's points
 FRAME_REACHES_M = (0.02, 0.015, 0.01)
 FRAME_TARGETS = 3
 SPEED_FRAMES = 5  # over which the motion before a break is taken
-LOOP_APART = 3  # fragments this far apart in time that overlap close a loop
 MIN_FLOOR_SHARE = 0.05  # of frames that must show a floor for it to count as found
 
 Progress = Callable[[str, int, int], None]

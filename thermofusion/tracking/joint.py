@@ -12,6 +12,9 @@ from ..types import Float
 from .maps import DepthMap
 from .registration import MIN_PARTNERS, find_partners, normal_equations, shape_weights
 
+GOOD_SHARE = 0.4  # of a map's points: smaller overlaps, seen obliquely, serve where there are few better ones
+LOOP_APART = 3  # maps this far apart in time that overlap close a loop
+
 
 def solve_jointly(
     maps: Sequence[DepthMap],
@@ -68,7 +71,7 @@ def overlapping(
 ) -> list[tuple[int, int]]:
     """Pairs (source, target) of maps that see the same surface: neighbours in the list, and the best others.
 
-    Each map keeps its `per_map` largest overlaps of at least `min_share` of its points.
+    Each map keeps about `per_map` overlaps of at least `min_share` of its points.
     """
     axis = poses[:, :3, 2]
     near = axis @ axis.T > np.cos(np.radians(max_turn_deg))
@@ -82,8 +85,11 @@ def overlapping(
             if partners.fitness >= min_share:
                 found.append((-partners.fitness, int(j)))
         found.sort()
-        chosen = {j for _, j in _spread(found, per_map)} | {j for _, j in found if abs(i - j) == 1}
-        pairs |= {(i, j) for j in chosen if (j, i) not in pairs}
+        good = [f for f in found if -f[0] >= GOOD_SHARE]
+        chosen = _spread(good if len(good) >= per_map // 2 else found, per_map)
+        # in time the nearest, whatever they share; and of those far in time the best, for a loop hangs on it
+        chosen += [f for f in found if abs(i - f[1]) == 1] + [f for f in found if abs(i - f[1]) >= LOOP_APART][:1]
+        pairs |= {(i, j) for _, j in chosen if (j, i) not in pairs}
     return sorted(pairs)
 
 

@@ -138,15 +138,15 @@ def _color_rows(p: Float, intensity: Float, texture: Float, off_px: Float, fx: f
 
 
 def shape_weights(rows: Rows) -> Float:
-    """Weight of each distance: 1/z⁴ for depth noise, times a Geman-McClure factor at twice the residuals' spread."""
+    """Weight of each distance: 1/z⁴ for depth noise, times a Cauchy factor at twice the residuals' spread."""
     noise = rows.points[:, 2] ** 2
     return _robust(rows.residual / noise, NOISE_FLOOR_M) / noise**2
 
 
 def _robust(r: Float, floor: float) -> Float:
-    """1/σ² times the Geman-McClure factor, σ from the residuals' own median."""
+    """1/σ² times the Cauchy factor, σ from the residuals' own median."""
     sigma = max(1.4826 * float(np.median(np.abs(r))), floor)
-    return np.asarray(1 / ((1 + (r / (2 * sigma)) ** 2) ** 2 * sigma**2))
+    return np.asarray(1 / ((1 + (r / (2 * sigma)) ** 2) * sigma**2))
 
 
 def normal_equations(partners: Partners, T_world_target: Float) -> tuple[Float, Float]:
