@@ -56,7 +56,8 @@ def test_every_command_is_written_down():
 def test_keys_set_in_the_documentation_exist():
     for page in PAGES:
         for item in re.findall(r"--set ([a-z_]+\.[A-Za-z_0-9]+=[^\s`]+)", page.read_text(encoding="utf-8")):
-            load_recipe({}, [item])
+            if item != "section.key=value":
+                load_recipe({}, [item])
         for section, key in re.findall(r"`([a-z]+)\.([a-z][A-Za-z_0-9]+)`", page.read_text(encoding="utf-8")):
             if section in Recipe.model_fields and section not in ("input", "output"):
                 module = ROOT / "thermofusion" / f"{section}.py"
