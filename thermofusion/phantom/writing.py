@@ -85,4 +85,5 @@ def camera_json(camera: Camera, model: str) -> dict[str, Any]:
 
 
 def write_json(path: Path, document: dict[str, Any]) -> None:
+    """A document as indented JSON."""
     path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
