@@ -24,6 +24,8 @@ from .thermometry import _vertices_per_patch as vertices_per_patch
 from .types import Bool, Camera, Float, Float32, Int, Observations, Scan, SurfaceMesh
 from .uncertainty import BILINEAR_VARIANCE, AngleTables, ErrorModel, observation_variance, skin_slope
 
+WELL_SEEN_DEG = 60.0  # a map's error is stated for surface that two views saw straighter than this
+WELL_SEEN_COS = np.float32(np.cos(np.radians(WELL_SEEN_DEG)))
 ANGLE_CORRECTED = ("joint", "corrected-cos")
 
 
@@ -47,12 +49,14 @@ class Bench:
     """Vertices of a finished result, numbered without gaps, and all that it takes to solve them again.
 
     vertices : (V,) their numbers in the mesh. observations : of them, freed of the air path, clear of outlines or the
-    best there is. counts : (N,) what the finished map is made of: a part of the views must not fall back on worse.
-    L_reflected : (V,), and errors : as the finished result has them. per_patch : vertices that share a normal's error.
+    best there is. well_seen : (V,) two views had it in sight under 60°, near outlines or not. counts : (N,) what the
+    finished map is made of: a part of the views must not fall back on worse. L_reflected : (V,), and errors : as the
+    finished result has them. per_patch : vertices that share a normal's error.
     """
 
     vertices: NDArray[np.intp]
     observations: Observations
+    well_seen: Bool
     counts: Bool
     n_views: int
     blackbodies: tuple[BlackbodyReading, ...]
@@ -85,13 +89,15 @@ class Bench:
         errors, mapping = error_model(scan.sensor, recipe), recipe.mapping
         L_air = float(band.radiance(room.air_K))
         rows = remove_air_path(seen.observations, recipe.radiometry.transmission_per_m, L_air)
+        well_seen = np.bincount(rows.vertex[rows.cos_angle > WELL_SEEN_COS], minlength=len(surface)) >= 2
         rows = rows.select(clear_of_silhouettes(rows, len(surface), mapping.silhouette_px)[1])
         straight = rows.cos_angle >= np.float32(np.cos(np.radians(mapping.max_angle_deg)))
-        well_seen = np.bincount(rows.vertex[straight], minlength=len(surface)) > 0
+        straight_seen = np.bincount(rows.vertex[straight], minlength=len(surface)) > 0
         return cls(
             np.arange(len(surface)),
             rows,
-            straight | ~well_seen[rows.vertex],
+            well_seen,
+            straight | ~straight_seen[rows.vertex],
             len(seen.views),
             seen.blackbodies,
             scan.rig.thermal,
@@ -116,6 +122,7 @@ class Bench:
         return replace(
             self,
             vertices=self.vertices[chosen],
+            well_seen=self.well_seen[chosen],
             counts=self.counts[mine],
             observations=replace(rows, vertex=number[rows.vertex]),
             L_reflected=self.L_reflected[chosen],
@@ -131,13 +138,19 @@ class Bench:
         """Views that see the bench, in order of time."""
         return np.unique(self.observations.view)
 
-    def calibrate(self, views: Bool) -> CrosscalResult | None:
-        """Cross-calibration of the views of a mask (N_views,); None for methods without. Raises ScanError."""
+    def calibrate(self, views: Bool, vertices: Bool | None = None) -> CrosscalResult | None:
+        """Cross-calibration of the views of a mask (N_views,), from the vertices of a mask (V,) alone if given.
+
+        None for methods without. Raises ScanError.
+        """
         if self.recipe.radiometry.method != "joint":
             return None
-        clear = self.observations.edge_px >= np.float32(self.recipe.mapping.silhouette_px)
+        enters = self.observations.edge_px >= np.float32(self.recipe.mapping.silhouette_px)
+        enters &= views[self.observations.view]
+        if vertices is not None:
+            enters &= vertices[self.observations.vertex]
         return cross_calibrate(
-            self.observations.select(clear & views[self.observations.view]),
+            self.observations.select(enters),
             len(self),
             self.n_views,
             self.emissivity,

@@ -3,11 +3,12 @@
 Two maps from disjoint halves of the views err independently where the halves do. With T_A - T_B = e_A - e_B and inverse
 variances w_A, w_B the map of all views has an error of the size of (T_A - T_B)·√(w_A·w_B)/(w_A + w_B): half the
 difference for equal halves (half-sample replication, McCarthy 1969). Neighbouring views err alike (normals,
-registration), so halves are made of arcs: half as many consecutive views as see a typical spot.
+registration), so halves are made of arcs: half as many consecutive views as see a typical spot. The calibration is
+halved by itself, views in short turns and skin in patches, because arcs would tear the chain of overlapping views.
 
 What all views share does not show between halves. Two parts of it can be told otherwise: the point spread, by spreading
-the map once more (noise is kept out by multiplying what two halves say of it); and what the budget declares
-for air path, ε(0) and reflection. The rest (a wrong shape of the mesh, a wrong sensor curve) stays unknown.
+the map once more (noise is kept out by multiplying what two halves say of it); and what the budget declares for air
+path, ε(0) and reflection. The rest (a wrong shape of the mesh, a wrong sensor curve) stays unknown.
 """
 
 from __future__ import annotations
@@ -25,14 +26,15 @@ from .errorstats import Statistics
 from .leftout import Bench
 from .types import Bool, Float, SurfaceMesh
 
-WELL_SEEN_DEG = 60.0  # the map's error is stated for surface that two views saw straighter than this
+MIN_DONORS = 20  # vertices that may represent a class
 COUNT_CLASSES = (3, 4, 6, 9, 13, 19)  # lower ends of classes of views per vertex, after the first (2)
 HALVINGS = 3  # ways to cut the arcs: a weakly determined pattern differs much from one to the next
-DECLARED = ("shape", "air", "emissivity0", "reflected")  # parts of the budget that all views share
+DECLARED = ("shape", "silhouette", "air", "emissivity0", "reflected")  # parts of the budget that all views share
 OF_VIEWS = ("noise", "normals", "registration", "silhouette")  # parts that more views make smaller
+PATCH_M = 0.15  # skin this far apart errs independently: many windows of normals
 SAMPLING_PX2 = 1 / 6  # variance of bilinear sampling as a point spread, mean over sub-pixel positions
-REACH = 3.5  # sigmas to which the point spread is followed
-NEIGHBOURS = 12  # sampled vertices over which the squared effect of the point spread is averaged
+REACH = 2.5  # sigmas to which the point spread is followed
+NEIGHBOURS = 4  # sampled vertices over which the squared effect of the point spread is averaged
 NODES, NODE_WEIGHTS = np.polynomial.hermite_e.hermegauss(7)
 
 
@@ -43,7 +45,7 @@ class MapError:
     error : statistics; within_95 against the result's stated sigma. random : what halves of the views show alone.
     spread_rms_K : effect of the point spread; declared_rms_K : parts of the budget that all views share.
     arc_views : consecutive views that stay together in a half. coverage : share of that surface which both halves of
-    some pair saw; surface that as many views saw represents the rest. sigma_ratio : rms of error over stated sigma.
+    some cut saw; surface that as many views saw represents the rest. sigma_ratio : rms of error over stated sigma.
     """
 
     error: Statistics
@@ -58,10 +60,9 @@ class MapError:
 
 @dataclass(frozen=True, eq=False)
 class Halves:
-    """One cut of the views: the two masks (N_views,), their calibrations, and (T_A - T_B) as an error (V,) K."""
+    """One cut of the views into arcs: two masks (N_views,), and (T_A - T_B) as an error of the whole map, (V,) K."""
 
     masks: tuple[Bool, Bool]
-    calibrations: tuple[CrosscalResult | None, CrosscalResult | None]
     error_K: Float
 
 
@@ -75,53 +76,90 @@ def map_error(bench: Bench, dense: Bench, surface: SurfaceMesh, sigma_K: NDArray
 
     Raises ScanError where halves of the views cannot be compared.
     """
-    rows = bench.observations.select(bench.counts)
-    limit = np.float32(np.cos(np.radians(WELL_SEEN_DEG)))
-    well_seen = np.bincount(rows.vertex[rows.cos_angle > limit], minlength=len(bench)) >= 2
-    count = np.bincount(rows.vertex, minlength=len(bench))
-    if not well_seen.any():
+    count = np.bincount(bench.observations.vertex[bench.counts], minlength=len(bench))
+    wanted = np.flatnonzero(bench.well_seen & (count > 0))
+    if not len(wanted):
         raise ScanError("no spot was seen by two views under 60°")
-    arc = int(np.clip(np.median(count[well_seen]) // 2, 1, len(bench.seen_views) // 2))
-    shifts = sorted({round(k * arc / HALVINGS) for k in range(HALVINGS)})
-    cuts = [_halves(bench, arc, shift) for shift in shifts]
-    vertex = np.concatenate([np.flatnonzero(well_seen & np.isfinite(c.error_K)) for c in cuts])
-    if not len(vertex):
-        raise ScanError("no spot was seen by both halves of the views")
-    random = np.concatenate([_level_removed(c.error_K[well_seen & np.isfinite(c.error_K)]) for c in cuts])
-    weight = _representing(count, well_seen, vertex)
-
+    arc = int(np.clip(np.median(count[wanted]) // 2, 1, len(bench.seen_views) // 2))
     everything = np.ones(bench.n_views, bool)
-    parts = bench.blend(everything, bench.calibrate(everything)).uncertainty.parts_K
-    declared = np.sqrt(sum((np.nan_to_num(parts[k]) ** 2 for k in DECLARED if k in parts), np.zeros(len(bench))))
-    spread = _point_spread(bench, dense, surface, cuts[0], psf_sigma_px)
-    shared = np.hypot(declared, spread)[vertex]
-    error = (random[:, None] + shared[:, None] * NODES).ravel()  # shared parts are normal, unknown in sign
-    weights = (weight[:, None] * NODE_WEIGHTS).ravel()
-    sigma = np.repeat(sigma_K[bench.vertices][vertex].astype(np.float64), len(NODES))
+    calibration = bench.calibrate(everything)
+    whole = bench.blend(everything, calibration)
+    cuts, random, covered = [], [], np.zeros(len(wanted), bool)
+    for k, shift in enumerate(sorted({round(k * arc / HALVINGS) for k in range(HALVINGS)})):
+        cuts.append(_halves(bench, calibration, arc, shift))
+        error = cuts[k].error_K
+        if calibration is not None:
+            error = error + _calibration_error(bench, calibration, surface.vertices_m[bench.vertices], k)
+        covered |= np.isfinite(error[wanted])
+        random.append(_completed(error[wanted], _own(whole)[wanted], count[wanted]))
+
+    parts = whole.uncertainty.parts_K
+    declared = np.sqrt(sum((np.nan_to_num(parts[k]) ** 2 for k in DECLARED if k in parts), np.zeros(len(bench))))[
+        wanted
+    ]
+    spread = _point_spread(bench, dense, surface, calibration, cuts[0].masks, psf_sigma_px)[wanted]
+    # shared parts are taken as normal, of unknown sign
+    error = (np.concatenate(random)[:, None] + np.tile(np.hypot(declared, spread), len(cuts))[:, None] * NODES).ravel()
+    weight = np.tile(NODE_WEIGHTS, len(wanted) * len(cuts))
+    sigma = np.repeat(np.tile(sigma_K[bench.vertices][wanted].astype(np.float64), len(cuts)), len(NODES))
     known = np.isfinite(sigma) & (sigma > 0)
     return MapError(
-        error=Statistics.of(error, sigma, weights),
-        random=Statistics.of(random, None, weight),
-        spread_rms_K=_rms(spread[vertex], weight),
-        declared_rms_K=_rms(declared[vertex], weight),
+        error=Statistics.of(error, sigma, weight),
+        random=Statistics.of(np.concatenate(random)),
+        spread_rms_K=float(np.sqrt(np.mean(spread**2))),
+        declared_rms_K=float(np.sqrt(np.mean(declared**2))),
         arc_views=arc,
         halvings=len(cuts),
-        coverage=len(np.unique(vertex)) / int(well_seen.sum()),
-        sigma_ratio=_rms(error[known] / sigma[known], weights[known]),
+        coverage=float(covered.mean()),
+        sigma_ratio=float(np.sqrt(np.average((error[known] / sigma[known]) ** 2, weights=weight[known]))),
     )
 
 
-def _halves(bench: Bench, arc: int, shift: int) -> Halves:
-    """Arcs of views by turns in one half and the other."""
+def _completed(error: Float, own: Float, count: NDArray) -> Float:
+    """Errors (N,) about their level; where one half saw nothing, drawn in turn from vertices that as many views saw.
+
+    Drawn in units of `own`, what single views add to a vertex by the budget: a spot that one view saw has no halves.
+    """
+    out, group = error - np.nanmedian(error), np.searchsorted(COUNT_CLASSES, count, side="right")
+    if not np.isfinite(error).any():
+        raise ScanError("no spot was seen by both halves of the views")
+    for g in np.unique(group):
+        mine, donors = group == g, np.flatnonzero((group == g) & np.isfinite(error))
+        donors = donors if len(donors) >= MIN_DONORS else np.flatnonzero(np.isfinite(error))
+        lost = np.flatnonzero(mine & ~np.isfinite(error))
+        out[lost] = np.resize(out[donors] / own[donors], len(lost)) * own[lost]
+    return out
+
+
+def _halves(bench: Bench, calibration: CrosscalResult | None, arc: int, shift: int) -> Halves:
+    """Arcs of views by turns in one half and the other, under one calibration."""
+    masks = _by_turns(bench, arc, shift)
+    a, b = (bench.blend(mask, calibration) for mask in masks)
+    s_a, s_b = _own(a), _own(b)
+    return Halves(masks, np.asarray((a.temperature_K - b.temperature_K) * s_a * s_b / (s_a**2 + s_b**2)))
+
+
+def _by_turns(bench: Bench, length: int, shift: int) -> tuple[Bool, Bool]:
+    """Masks (N_views,) of groups of consecutive views by turns."""
     views = bench.seen_views
     in_A, in_B = np.zeros(bench.n_views, bool), np.zeros(bench.n_views, bool)
-    turn = ((np.arange(len(views)) + shift) // arc) % 2 == 0
+    turn = ((np.arange(len(views)) + shift) // length) % 2 == 0
     in_A[views[turn]], in_B[views[~turn]] = True, True
-    calibrations = (bench.calibrate(in_A), bench.calibrate(in_B))
-    a, b = (bench.blend(m, c) for m, c in zip((in_A, in_B), calibrations, strict=True))
-    s_a, s_b = (_own(r) for r in (a, b))
-    error = (a.temperature_K - b.temperature_K) * s_a * s_b / (s_a**2 + s_b**2)
-    return Halves((in_A, in_B), calibrations, np.asarray(error))
+    return in_A, in_B
+
+
+def _calibration_error(bench: Bench, calibration: CrosscalResult, place_m: NDArray, k: int) -> Float:
+    """(V,) K, what a calibration from other views and other skin would change, halved.
+
+    Views alternate singly, in pairs or in threes: longer arcs would cut the chain of overlaps that the whole scan has.
+    Skin alternates in cubes: errors of normals are common to all views of a patch.
+    """
+    cube = np.floor(place_m / PATCH_M + 0.5 * k).astype(int).sum(1) % 2 == 0
+    change = []
+    for mask, skin in zip(_by_turns(bench, k + 1, 0), (cube, ~cube), strict=True):
+        own = bench.blend(mask, bench.calibrate(mask, skin))
+        change.append(own.temperature_K - bench.blend(mask, calibration).temperature_K)
+    return np.asarray(0.5 * (change[0] - change[1]))
 
 
 def _own(result: BlendResult) -> Float:
@@ -130,43 +168,30 @@ def _own(result: BlendResult) -> Float:
     return np.sqrt(np.sum([parts[k].astype(np.float64) ** 2 for k in OF_VIEWS if k in parts], axis=0))
 
 
-def _representing(count: NDArray, well_seen: Bool, vertex: NDArray) -> Float:
-    """Weights of `vertex` (N,), so that classes of views per vertex count as on all surface that was well seen."""
-    group = np.searchsorted(COUNT_CLASSES, count, side="right")
-    wanted = np.bincount(group[well_seen], minlength=len(COUNT_CLASSES) + 1)
-    had = np.bincount(group[vertex], minlength=len(COUNT_CLASSES) + 1)
-    return np.asarray((wanted / np.maximum(had, 1))[group[vertex]])
-
-
-def _level_removed(error: Float) -> Float:
-    return np.asarray(error - np.median(error)) if len(error) else error
-
-
-def _rms(values: NDArray, weight: NDArray) -> float:
-    return (
-        float(np.sqrt(np.average(np.asarray(values, np.float64) ** 2, weights=weight))) if len(values) else float("nan")
-    )
-
-
 # ---------------------------------------------------------------- point spread
 
 
-def _point_spread(bench: Bench, dense: Bench, surface: SurfaceMesh, cut: Halves, psf_sigma_px: float) -> Float:
+def _point_spread(
+    bench: Bench,
+    dense: Bench,
+    surface: SurfaceMesh,
+    calibration: CrosscalResult | None,
+    masks: tuple[Bool, Bool],
+    psf_sigma_px: float,
+) -> Float:
     """(V_bench,) K, size of what the point spread G takes off or adds: the root of the local mean of b_A·b_B.
 
-    The map is spread already, so b = (1 - G)∗(2 - G)∗T: the first two terms of undoing it (van Cittert 1931). Both
-    halves are spread alike and noisy independently, so that the product's mean has no noise in it.
+    b = T - G∗T: what spreading the map, spread already, once more takes off (the first term of undoing it). Both halves
+    are spread alike and noisy independently, so that the product's mean has no noise in it.
     """
     sigma_m = _spread_m(bench, psf_sigma_px)
     start, vertex, distance2 = _neighbours(surface, bench.vertices, float(np.nanmedian(sigma_m)))
     owner = np.repeat(np.arange(len(bench)), np.diff(start))
-    exponent = -0.5 * distance2 / sigma_m[owner] ** 2
-    once, twice = np.exp(exponent), np.exp(0.5 * exponent)  # G and G∗G
+    kernel = np.exp(-0.5 * distance2 / sigma_m[owner] ** 2)
     effect = []
-    for mask, calibration in zip(cut.masks, cut.calibrations, strict=True):
+    for mask in masks:
         T = dense.blend(mask, calibration).temperature_K
-        spread = [_weighted_mean(T[vertex], kernel, owner, len(bench)) for kernel in (once, twice)]
-        effect.append(2 * T[bench.vertices] - 3 * spread[0] + spread[1])
+        effect.append(T[bench.vertices] - _weighted_mean(T[vertex], kernel, owner, len(bench)))
     product = effect[0] * effect[1]
     both = np.flatnonzero(np.isfinite(product))
     out = np.zeros(len(bench))

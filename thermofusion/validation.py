@@ -17,8 +17,8 @@ import numpy as np
 
 from .errors import RecipeError, ScanError
 from .errorstats import Statistics, robust_rms
-from .leftout import Bench, LeftOut
-from .maperror import WELL_SEEN_DEG, MapError, map_error
+from .leftout import WELL_SEEN_DEG, Bench, LeftOut
+from .maperror import MapError, map_error
 from .recipe import Recipe
 from .rundir import to_json, write_text
 from .types import Scan
