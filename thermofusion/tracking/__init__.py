@@ -105,7 +105,8 @@ def track(scan: Scan, recipe: Recipe, *, progress: Progress | None = None) -> Tr
         )
     placed, lost = _join(segments, frames, scan.depth.times_s, recipe)
     placed, loops, converged, message = _solve(placed, recipe)
-    return _result(scan, frames, indices, placed, lost, loops, converged, message)
+    refined = _refined(placed) if recipe.tracking.refine_to_model else [p.frame_poses() for p in placed]
+    return _result(scan, frames, indices, placed, refined, lost, loops, converged, message)
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,6 +273,7 @@ def _result(
     frames: TrackingFrames,
     indices: NDArray[np.intp],
     placed: list[_Placed],
+    refined: list[Float],
     lost: list[LostRange],
     loops: int,
     converged: bool,
@@ -280,7 +282,7 @@ def _result(
     n = len(scan.depth)
     T, tracked = np.tile(np.eye(4), (n, 1, 1)), np.zeros(n, bool)
     fitness, residual = np.full(n, np.nan), np.full(n, np.nan)
-    for p, poses in zip(placed, _refined(placed), strict=True):
+    for p, poses in zip(placed, refined, strict=True):
         s = p.segment
         T[s.frames], tracked[s.frames] = poses, True
         fitness[s.frames], residual[s.frames] = s.fitness, s.residual_mm

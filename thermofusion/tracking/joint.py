@@ -23,7 +23,7 @@ def solve_jointly(
     reach_m: float,
     *,
     fixed: int = 0,
-    max_iterations: int = 8,
+    max_iterations: int = 15,
     tolerance: float = 1e-4,
 ) -> tuple[Float, float, bool]:
     """All poses (F, 4, 4) T_world_map at once, from point-to-plane residuals over all edges (source, target).
