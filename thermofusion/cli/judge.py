@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from .console import emit, progress
+from .console import emit, note, progress
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Overrides = Annotated[list[str] | None, typer.Option("--set", help="section.key=value, over the recipe; repeatable")]
@@ -16,6 +16,7 @@ Overrides = Annotated[list[str] | None, typer.Option("--set", help="section.key=
 def register(app: typer.Typer) -> None:
     """Add this module's verbs."""
     app.command()(validate)
+    app.command()(compare)
 
 
 def validate(
@@ -39,3 +40,26 @@ def validate(
     with progress(json) as step:
         report = judge(recording, chosen, out=out, folds=folds, motion=motion, progress=step)
     emit(report, report.text(), json)
+
+
+def compare(
+    first: Annotated[Path, typer.Argument(help="A result folder, or a mesh (.ply, .glb, .vtp).")],
+    second: Annotated[
+        Path,
+        typer.Argument(help="The same; or a truth (.npz, or a simulated scan); or contact readings (.csv, .json)."),
+    ],
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder for report, plot and difference map.")] = None,
+    mirror: Annotated[bool, typer.Option("--mirror", help="Mirror the second, left for right, first.")] = False,
+    registered: Annotated[bool, typer.Option("--register/--no-register", help="Lay one surface on the other.")] = True,
+    max_distance_mm: Annotated[float, typer.Option(min=0.1, help="Between partners on the two surfaces.")] = 10.0,
+    json: Json = False,
+) -> None:
+    """A result against another one, its mirror image, a truth, or contact readings: bias and limits of agreement."""
+    from ..compare import compare as judge
+    from ..compare import write_comparison
+
+    found = judge(first, second, mirror=mirror, moved=registered, max_distance_m=max_distance_mm / 1e3)
+    written = [] if out is None else write_comparison(found, out)
+    emit(found.report(), found.text(), json)
+    for path in written:
+        note(f"wrote {path}")
