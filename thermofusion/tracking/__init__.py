@@ -28,7 +28,7 @@ from .odometry import GrowingSegment, Segment, odometry
 from .registration import register
 from .relocalise import find_join
 
-REACHES_M = (0.08, 0.03, 0.015)  # of partners, round by round
+ROUNDS = ((0.08, 4), (0.03, 2), (0.015, 1))  # of the joint solution: reach of partners in m, every how many points
 PARTNERS_PER_FRAGMENT = 8
 MIN_OVERLAP = 0.2  # of a fragment's points
 FRAME_REACHES_M = (0.02, 0.015, 0.01)
@@ -234,12 +234,12 @@ def _solve(placed: list[_Placed], recipe: Recipe) -> tuple[list[_Placed], int, b
     maps, T = [f.map for f, _ in fragments], np.array([T for _, T in fragments])
     loops, converged = 0, True
     if len(fragments) > 1:
-        for reach in REACHES_M:
+        for reach, stride in ROUNDS:
             edges = overlapping(maps, T, reach, per_map=PARTNERS_PER_FRAGMENT, min_share=MIN_OVERLAP)
             if not recipe.tracking.loop_closure:
                 edges = [(i, j) for i, j in edges if abs(i - j) < LOOP_APART]
             fixed = len(fragments) // 2
-            T, _, converged = solve_jointly(maps, T, edges, reach, fixed=fixed)
+            T, _, converged = solve_jointly(maps, T, edges, reach, fixed=fixed, stride=stride)
             loops = sum(abs(i - j) >= LOOP_APART for i, j in edges)
     solved, at = [], 0
     for p in placed:

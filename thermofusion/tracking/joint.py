@@ -23,20 +23,22 @@ def solve_jointly(
     reach_m: float,
     *,
     fixed: int = 0,
+    stride: int = 1,
     max_iterations: int = 15,
     tolerance: float = 1e-4,
 ) -> tuple[Float, float, bool]:
     """All poses (F, 4, 4) T_world_map at once, from point-to-plane residuals over all edges (source, target).
 
     The pose graph with its residuals kept instead of summarised: partners are found anew in every step. Pose `fixed`
-    stays. Returns (poses, weighted rms in m, converged: last step below `tolerance` rad and m).
+    stays; `stride` thins the samples out. Returns (poses, weighted rms in m, converged: last step below `tolerance` rad
+    and m).
     """
     T, n, rms = poses.copy(), len(poses), float("nan")
     for _ in range(max_iterations):
         A, b, total, weight = np.zeros((6 * n, 6 * n)), np.zeros(6 * n), 0.0, 0.0
         for i, j in edges:
-            partners = find_partners(maps[i], maps[j], invert(T[j]) @ T[i], reach_m)
-            if len(partners) < MIN_PARTNERS:
+            partners = find_partners(maps[i], maps[j], invert(T[j]) @ T[i], reach_m, stride)
+            if len(partners) < MIN_PARTNERS // stride:
                 continue
             h, g = normal_equations(partners, T[j])
             si, sj = slice(6 * i, 6 * i + 6), slice(6 * j, 6 * j + 6)
