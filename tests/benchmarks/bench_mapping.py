@@ -9,8 +9,11 @@ RESULT is a finished result folder of SCAN. Prints ms a view for our projection;
 from __future__ import annotations
 
 import argparse
+import os
 import time
 from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line sets it; before NumPy is loaded
 
 import numpy as np
 
