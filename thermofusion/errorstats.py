@@ -28,7 +28,7 @@ class Statistics:
             return cls(0, *[float("nan")] * 5)
         e, w = np.asarray(error_K, np.float64), np.ones(len(error_K)) if weight is None else weight
         w = w / w.sum()
-        inside = float("nan") if sigma_K is None else float(w @ (np.abs(e) <= NORMAL_95 * sigma_K))
+        inside = float("nan") if sigma_K is None else min(float(w @ (np.abs(e) <= NORMAL_95 * sigma_K)), 1.0)
         p95 = weighted_quantile(np.abs(e), w, 0.95)
         return cls(len(e), float(w @ e), float(w @ np.abs(e)), float(np.sqrt(w @ e**2)), p95, inside)
 

@@ -13,7 +13,7 @@ path, ε(0) and reflection. The rest (a wrong shape of the mesh, a wrong sensor 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,10 +93,7 @@ def map_error(bench: Bench, dense: Bench, surface: SurfaceMesh, sigma_K: NDArray
         covered |= np.isfinite(error[wanted])
         random.append(_completed(error[wanted], _own(whole)[wanted], count[wanted]))
 
-    parts = whole.uncertainty.parts_K
-    declared = np.sqrt(sum((np.nan_to_num(parts[k]) ** 2 for k in DECLARED if k in parts), np.zeros(len(bench))))[
-        wanted
-    ]
+    declared = _declared(bench, calibration, whole)[wanted]
     spread = _point_spread(bench, dense, surface, calibration, cuts[0].masks, psf_sigma_px)[wanted]
     # shared parts are taken as normal, of unknown sign
     error = (np.concatenate(random)[:, None] + np.tile(np.hypot(declared, spread), len(cuts))[:, None] * NODES).ravel()
@@ -113,6 +110,23 @@ def map_error(bench: Bench, dense: Bench, surface: SurfaceMesh, sigma_K: NDArray
         coverage=float(covered.mean()),
         sigma_ratio=float(np.sqrt(np.average((error[known] / sigma[known]) ** 2, weights=weight[known]))),
     )
+
+
+def _declared(bench: Bench, calibration: CrosscalResult | None, whole: BlendResult) -> Float:
+    """(V,) K, what the budget holds of errors that all views share.
+
+    The fitted shape of ε(θ) is one of them as far as its uncertainty is no matter of noise (normals bend it).
+    """
+    parts = whole.uncertainty.parts_K
+    squares = sum(
+        (np.nan_to_num(parts[k].astype(np.float64)) ** 2 for k in DECLARED if k in parts), np.zeros(len(bench))
+    )
+    if calibration is not None:
+        bend = np.sqrt(max(calibration.shape_sigma**2 - float(calibration.covariance[-2, -2]), 0.0))
+        bent = bench.blend(np.ones(bench.n_views, bool), replace(calibration, shape=calibration.shape + bend))
+        change = bent.temperature_K - whole.temperature_K
+        squares += np.nan_to_num(change - np.nanmedian(change)) ** 2
+    return np.sqrt(squares)
 
 
 def _completed(error: Float, own: Float, count: NDArray) -> Float:

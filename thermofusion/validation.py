@@ -100,7 +100,7 @@ def _map_lines(m: MapError) -> list[str]:
         f"{m.random.rmse_K:.4f} K between halves",
         f"             of the views ({m.halvings} cuts, arcs of {m.arc_views}, {m.coverage:.0%} seen by both); "
         f"{m.spread_rms_K:.4f} K",
-        f"             point spread; {m.declared_rms_K:.4f} K air, ε(0) and reflection, as declared",
+        f"             point spread; {m.declared_rms_K:.4f} K air, ε and reflection, as declared",
     ]
 
 
