@@ -119,7 +119,7 @@ def test_method_without_calibration_is_predicted_too():
     [(0, 0.05, 0.5, 0.0, True), (1, 0.15, 2.0, 0.0, True), (2, 0.03, 1.0, 0.3, True), (3, 0.10, 0.2, 0.3, False)],
 )
 def test_the_maps_own_error_is_told_without_truth(seed, netd_K, drift_K, normal_deg, field):
-    """MAE, RMSE and p95 of the relative temperature within 20 % of the true ones, for other noise, drift and normals."""
+    """MAE, RMSE and p95 of the relative temperature within 20 % of the true ones, whatever noise, drift and normals."""
     world = make_world(
         seed, n_vertices=6000, n_views=36, netd_K=netd_K, drift_K=drift_K, normal_error_deg=normal_deg, field=field
     )
