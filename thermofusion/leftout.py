@@ -18,9 +18,7 @@ from .radiometry import ZERO_DEGC_K, Band
 from .recipe import Recipe
 from .references import BlackbodyReading
 from .surroundings import surroundings
-from .thermometry import Seen, Temperature, room_of, surface_gradient
-from .thermometry import _errors as error_model
-from .thermometry import _vertices_per_patch as vertices_per_patch
+from .thermometry import Seen, Temperature, error_model, room_of, surface_gradient, vertices_per_patch
 from .types import Bool, Camera, Float, Float32, Int, Observations, Scan, SurfaceMesh
 from .uncertainty import BILINEAR_VARIANCE, AngleTables, ErrorModel, observation_variance, skin_slope
 

@@ -191,7 +191,7 @@ def measure(
         return around.reflected_radiance(L_room, skin, emissivity=model.hemispherical)
 
     L_reflected = reflected(np.full(len(surface), np.median(observations.radiance), np.float32))
-    errors = _errors(scan.sensor, recipe)
+    errors = error_model(scan.sensor, recipe)
     calibration, notes = _calibrate(scan, surface, seen, witnesses, recipe, model, band, L_reflected, errors)
 
     def blended(settings: RadiometrySection, *, with_uncertainty: bool = True) -> BlendResult:
@@ -313,7 +313,8 @@ def _contacts(scan: Scan, surface: SurfaceMesh, band: Band) -> list[ContactReadi
     return readings
 
 
-def _errors(sensor: ThermalSensor, recipe: Recipe) -> ErrorModel:
+def error_model(sensor: ThermalSensor, recipe: Recipe) -> ErrorModel:
+    """One-sigma errors of an observation's parts, from the sensor and the recipe."""
     r = recipe.radiometry
     return ErrorModel(
         netd_K=sensor.netd_K,
@@ -355,12 +356,12 @@ def _calibrate(
         max_angle_deg=recipe.mapping.max_angle_deg,
         blackbodies=seen.blackbodies,
         contacts=_contacts(scan, surface, band),
-        vertices_per_patch=_vertices_per_patch(surface, recipe.fusion.normal_window_mm / 1e3),
+        vertices_per_patch=vertices_per_patch(surface, recipe.fusion.normal_window_mm / 1e3),
     )
     return calibration, calibration.messages
 
 
-def _vertices_per_patch(surface: SurfaceMesh, window_m: float) -> float:
+def vertices_per_patch(surface: SurfaceMesh, window_m: float) -> float:
     """Vertices in a disc of the normals' window: they share their normal, and with it their error."""
     a, b, c = (surface.vertices_m[surface.triangles[:, k]] for k in range(3))
     area_m2 = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())

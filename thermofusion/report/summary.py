@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import __version__
-from ..geometry import rotation_angle_deg
+from ..geometry import invert, rotation_angle_deg
 from ..recipe import Recipe
 from ..types import Scan, VertexFlag
 
@@ -151,7 +151,7 @@ def _alignment(scan: Scan, a: AlignmentResult) -> dict[str, Any]:
         "changed": a.changed,
         "converged": a.converged,
         "T_thermal_depth": a.T_thermal_depth,
-        "rotation_deg": 0.0 if start is None else float(rotation_angle_deg(a.T_thermal_depth @ np.linalg.inv(start))),
+        "rotation_deg": 0.0 if start is None else float(rotation_angle_deg(a.T_thermal_depth @ invert(start))),
         "time_offset_s": a.time_offset_s,
         "residual_px_before": a.residual_px_before,
         "residual_px_after": a.residual_px_after,
