@@ -9,7 +9,7 @@ from .board import Board
 from .boards import board_pdf, board_svg
 from .calibrate import Calibrated, calibrate
 from .report import report_html
-from .rig import Calibration, calibrate_views, predict_px
+from .rig import Calibration, calibrate_views, held_out_px, predict_px
 from .rig_file import read_rig, rig_document, write_rig
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "board_svg",
     "calibrate",
     "calibrate_views",
+    "held_out_px",
     "predict_px",
     "read_rig",
     "report_html",

@@ -19,13 +19,14 @@ from .detect_blobs import detect_blobs
 from .detect_color import detect_color
 from .detect_thermal import is_saturated
 from .folder import CalibrationFolder, open_folder
-from .picks import read_picks_csv, read_picks_mat
+from .picks import interpolated, read_picks_csv, read_picks_mat
 from .pictures import draw_points, to_grey
 from .rig import Calibration, calibrate_views
 from .rounds import detect_thermal_set
 from .views import BoardPoints, CalibrationSet, View
 
 MIN_SHARE_FOUND = 0.3  # of the pictures; below this the board described is not the one in view
+MAX_INTERPOLATED = 0.3  # of picked points; more says that nobody looked at most of them
 PICTURES_CHECKED = 3  # for a second board, and for a board of another size
 Progress = Callable[[str], None]
 
@@ -92,6 +93,8 @@ def calibrate(
     if burnt:
         text = f"{len(burnt)} thermal pictures are saturated ({', '.join(burnt[:5])}): widen the temperature range"
         next_steps = (text, *next_steps)
+    if source is not None:
+        next_steps = (*_interpolated_picks(data), *next_steps)
     return Calibrated(folder, result, rejected, found, next_steps)
 
 
@@ -116,6 +119,21 @@ def _from_picks(folder: CalibrationFolder, path: Path) -> CalibrationSet:
             image = getattr(folder, camera)(next(iter(folder.files[camera])))
             sizes[camera] = (image.shape[1], image.shape[0])
     return CalibrationSet(folder.board, sizes, tuple(sorted(views, key=lambda v: v.name)))
+
+
+def _interpolated_picks(data: CalibrationSet) -> list[str]:
+    """A sentence for every camera whose picks are mostly no observations."""
+    out = []
+    for camera in data.cameras:
+        found = [interpolated(v.points[camera], data.board) for v in data.seen_by(camera)]
+        marks = [m for m in found if m is not None]
+        share = float(np.concatenate(marks).mean()) if marks else 0.0
+        if share > MAX_INTERPOLATED:
+            out.append(
+                f"{100 * share:.0f} % of the {camera} picks lie exactly on the perspective grid of their four corners: "
+                "they were interpolated, not seen, and hide the lens's distortion; let the detector find the points"
+            )
+    return out
 
 
 def _detect(folder: CalibrationFolder, progress: Progress) -> tuple[CalibrationSet, dict[str, dict[str, Float]]]:

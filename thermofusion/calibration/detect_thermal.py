@@ -18,7 +18,7 @@ from .views import BoardPoints
 
 SPOT_SIGMA_PX = 1.2
 MIN_SNR = 3.0  # of a point accepted by itself
-WEAK_SNR = 2.4  # of one that has the sign of its neighbours and lies where they say
+WEAK_SNR = 2.1  # of one that has the sign of its neighbours and lies where they say: noise does so in one of 20
 FIXED_PATTERN_VIEWS = 8  # pictures from which a sensor's own pattern can be told from the scene
 MIN_SHARE = 0.4  # of a board's points that make it found
 SATURATED_SHARE = 0.02

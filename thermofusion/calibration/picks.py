@@ -6,14 +6,17 @@ import csv
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import scipy.io
+from numpy.typing import NDArray
 
 from ..errors import ScanError
 from .board import Board
 from .views import BoardPoints, View
 
 CAMERAS = ("color", "thermal", "depth")
+INTERPOLATED_PX = 0.05  # no picture places a point this exactly on a grid again and again
 
 
 def read_picks_csv(path: Path, board: Board) -> list[View]:
@@ -98,6 +101,26 @@ def read_picks_mat(path: Path, spacing_m: float) -> tuple[Board, dict[str, tuple
         views.append(View(Path(name).stem, points))
     image_size = {c: (int(s[1]), int(s[0])) for c, s in zip(CAMERAS, sizes, strict=False)}
     return board, image_size, views
+
+
+def interpolated(points: BoardPoints, board: Board) -> NDArray[np.bool_] | None:
+    """(N,) True for points that lie exactly on the perspective grid of the board's four corner points; None if a corner
+    is missing.
+
+    Toolboxes let a person click four corners, lay a homography on them and move a point only where the picture says so.
+    What was not moved is no observation: it carries the errors of the four clicks and knows nothing of the lens.
+    """
+    corners = np.array([0, board.columns - 1, len(board) - board.columns, len(board) - 1])
+    row = {int(i): k for k, i in enumerate(points.index)}
+    if any(int(i) not in row for i in corners):
+        return None
+    grid = board.points_m[:, :2] / board.spacing_m
+    H = cv2.getPerspectiveTransform(
+        grid[corners].astype(np.float32), points.px[[row[int(i)] for i in corners]].astype(np.float32)
+    )
+    expected = cv2.perspectiveTransform(grid[points.index][:, None], H)[:, 0]
+    on_grid = np.linalg.norm(expected - points.px, axis=1) < INTERPOLATED_PX
+    return np.asarray(on_grid & ~np.isin(points.index, corners), bool)
 
 
 def _step(x: np.ndarray) -> float:

@@ -191,6 +191,25 @@ def predict_px(calibration: Calibration, view: View, *, camera: str = "thermal",
     return project_with_jacobian(X, fit.block(camera))[0] - view.points[camera].px
 
 
+def held_out_px(calibration: Calibration, view: View, *, camera: str = "thermal", group: int | None = None) -> Float:
+    """(N, 2) px residuals of `camera` in a view that took no part in the fit, as a training view would have them.
+
+    The rig is held; the board's pose, unknown for every view, is fitted to all cameras at the fit's own weights.
+    """
+    fit = calibration.fit
+    k = calibration.chosen_group if group is None else group
+    problem = Problem(replace(calibration.data, views=(view,)), groups={view.name: k})
+    own = f"view:{view.name}"
+    rig = {key: s for key, s in problem.slices.items() if key != own}
+    x = np.zeros(len(problem.names))
+    for key, s in rig.items():
+        x[s] = fit.block(key)
+    board = problem.data.board.points_m
+    x[problem.slices[own]] = to_rt(board_pose(view.points[problem.hub], board, fit.block(problem.hub)))
+    alone = solve(problem, x, replace(fit.options, fixed=frozenset(rig), priors={}))
+    return alone.residuals()[camera][0]
+
+
 def derived_extrinsics(fit: Fit, group: int) -> tuple[dict[str, Float], dict[str, Float]]:
     """T_color_depth, T_thermal_depth (or T_thermal_color without depth) and (6, 6) covariances of their (rotation
     vector [rad], translation [m]), by differences of the composed transform."""
@@ -223,4 +242,4 @@ def derived_extrinsics(fit: Fit, group: int) -> tuple[dict[str, Float], dict[str
     return out, cov
 
 
-__all__ = ["Calibration", "calibrate_views", "derived_extrinsics", "predict_px"]
+__all__ = ["Calibration", "calibrate_views", "derived_extrinsics", "held_out_px", "predict_px"]
