@@ -15,6 +15,8 @@ from .views import BoardPoints
 ARUCO_DICTIONARY = cv2.aruco.DICT_5X5_1000
 SB_FLAGS = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
 
+QUICK_PX = 480  # shorter side of the picture in which a board is looked for first
+
 
 def detect_color(image: NDArray, board: Board) -> BoardPoints | None:
     """Board points in an 8-bit picture (H, W) or (H, W, 3), or None if the board is not found.
@@ -29,13 +31,34 @@ def detect_color(image: NDArray, board: Board) -> BoardPoints | None:
         return _circles(grey, board)
     rim = 1 if board.kind == "pins" else 0
     size = (board.columns - 2 * rim, board.rows - 2 * rim)
-    found, corners = cv2.findChessboardCornersSB(grey, size, flags=SB_FLAGS)
-    if not found:
+    corners = _corners(grey, size)
+    if corners is None:
         return None
     px = corners.reshape(size[1], size[0], 2).astype(np.float64)
     index = np.arange(len(board)).reshape(board.rows, board.columns)
     index = index[rim : board.rows - rim, rim : board.columns - rim]
     return BoardPoints(index.ravel(), upright(px).reshape(-1, 2))
+
+
+def _corners(grey: NDArray, size: tuple[int, int]) -> NDArray | None:
+    """(N, 2) inner corners, or None. A quick look at a smaller picture finds where; exact search of that part saves 4/5."""
+    if min(grey.shape) >= 2 * QUICK_PX:
+        factor = min(grey.shape) // QUICK_PX
+        small = cv2.resize(grey, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA)
+        found, rough = cv2.findChessboardCornersSB(small, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+        if found:
+            places = factor * rough.reshape(-1, 2)
+            lo, hi = places.min(0), places.max(0)
+            margin = 2.0 * (hi - lo).max() / (min(size) - 1) + factor
+            u0, v0 = np.maximum(lo - margin, 0).astype(int)
+            u1, v1 = (hi + margin).astype(int) + 1
+            found, corners = cv2.findChessboardCornersSB(
+                np.ascontiguousarray(grey[v0:v1, u0:u1]), size, flags=SB_FLAGS
+            )
+            if found:
+                return corners.reshape(-1, 2) + np.array([u0, v0], np.float32)
+    found, corners = cv2.findChessboardCornersSB(grey, size, flags=SB_FLAGS)
+    return corners.reshape(-1, 2) if found else None
 
 
 def upright(grid: Float) -> Float:
