@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.io
+from averaged_frames import decode
 from scipy.special import ndtr
 
 from thermofusion.calibration.noise import allan_deviation, edge_spread, still_noise
@@ -21,6 +22,8 @@ from thermofusion.errors import ScanError
 
 # The curve of the paper's camera, digits as stored by its authors.
 EQ1 = (-3.459387450320374e05, 56.540702698830174, -3.46948481e-03, 9.47054240e-08, -9.69938020e-13)
+# The curve of their mid-wave camera, as the phantom images themselves give it (test below); stored nowhere.
+PHANTOM_QUARTIC = (-53.771, 4.5575e-3, -1.1621e-7, 1.692e-12, -9.9176e-18)
 
 
 def test_a_quartic_keeps_its_digits():
@@ -135,18 +138,57 @@ def test_the_warm_object_is_seen_by_both_cameras():
 
 
 def test_the_authors_phantom_pictures_are_reproduced(shared_data):
-    """A quartic maps raw counts to the authors' mean pictures: the level to 2 mK, a pixel to one frame's noise."""
-    folder = shared_data("jhu") / "phantom"
-    counts, degC = [], []
-    for T in (36, 40, 44):
-        raw = np.frombuffer((folder / f"{T}.raw").read_bytes(), ">u2", 81_920, 240)
-        counts.append(raw.astype(float))
-        degC.append(scipy.io.loadmat(folder / f"Aver_ImT_{T}.mat")["Aver_ImT"].ravel())
-    curve = fit_polynomial(np.concatenate(counts), np.concatenate(degC))
-    for g, T in zip(counts, degC, strict=True):
+    """Their images are the mean of eight frames' temperatures, one quartic, no field; the recording keeps one frame.
+
+    Every pixel of all three images says so to below a microkelvin, and the kept frame is a possible one of the eight
+    everywhere. Where all eight agree (whole levels of 16 counts), its counts alone give the image, and the quartic.
+    """
+    counts, degC = phantom(shared_data("jhu") / "phantom")
+    found = decode(degC, (counts - 3) / 16, frames=8)
+    assert np.abs(found.degC - degC).max() < 1e-6
+    assert found.may_hold((counts - 3) / 16).all()
+    same = found.spread < 1e-6
+    assert same.sum() > 200
+    curve = fit_polynomial(counts[same], degC[same])
+    np.testing.assert_allclose(curve.parameters, PHANTOM_QUARTIC, rtol=1e-11)
+    np.testing.assert_allclose(evaluate("polynomial", PHANTOM_QUARTIC, counts[same]), degC[same], atol=1e-12)
+    # a frame by itself cannot: one level is 6 to 14 mK, its noise as much
+    single = np.abs(evaluate("polynomial", PHANTOM_QUARTIC, counts) - degC)
+    assert np.mean(single < 1e-3) < 0.1
+    assert decode(degC, (counts - 3) / 16, frames=7).may_hold((counts - 3) / 16).mean() < 0.2  # and seven frames do not
+
+
+def test_averaged_frames_are_told_apart():
+    """The method of the test above on images made for it; one frame's own mean is half a level off."""
+    rng = np.random.default_rng(0)
+    level = np.round(2300 + 1600 * rng.beta(0.6, 0.6, 60_000) + rng.normal(0, 1, (8, 60_000)))
+    level[0] = np.round(level[0] - 0.5)
+    degC = evaluate("polynomial", PHANTOM_QUARTIC, 16 * level + 3).mean(axis=0)
+    found = decode(degC, level[0], frames=8)
+    np.testing.assert_array_equal(found.total, level.sum(axis=0))
+    np.testing.assert_allclose(found.spread, 8 * level.var(axis=0), atol=1e-6)
+    np.testing.assert_allclose(
+        found.curve(level[0]), evaluate("polynomial", PHANTOM_QUARTIC, 16 * level[0] + 3), atol=1e-8
+    )
+
+
+def test_a_curve_from_raw_frames_is_true_in_level(shared_data):
+    """What a laboratory would do: the quartic from single frames against the images, noise and all."""
+    counts, degC = phantom(shared_data("jhu") / "phantom")
+    curve = fit_polynomial(counts, degC)
+    for g, T in zip(counts.reshape(3, -1), degC.reshape(3, -1), strict=True):
         error = curve.to_degC(g) - T
         assert abs(error.mean()) < 2e-3
         assert np.median(np.abs(error)) < 0.01
+
+
+def phantom(folder):
+    """Raw counts (N,) of one frame and the authors' mean temperatures (N,), three images after each other."""
+    counts, degC = [], []
+    for T in (36, 40, 44):
+        counts.append(np.frombuffer((folder / f"{T}.raw").read_bytes(), ">u2", 81_920, 240).astype(float))
+        degC.append(scipy.io.loadmat(folder / f"Aver_ImT_{T}.mat")["Aver_ImT"].ravel())
+    return np.concatenate(counts), np.concatenate(degC)
 
 
 def test_the_authors_field_flattens_a_real_frame(shared_data):
