@@ -55,8 +55,8 @@ def decode(degC: Float, level: Float, frames: int) -> Decoded:
 
 
 def _climb(T: Float) -> Float:
-    """Rungs of the values (M,), sorted, but for a constant: from the clearest window outwards, each step predicted by the
-    polynomial through those before it."""
+    """Rungs of the values (M,), sorted, but for a constant: from the clearest window outwards, each step predicted
+    by the polynomial through those before it."""
     edges = np.arange(T[0], T[-1] + WINDOW_K, WINDOW_K)
     count = np.histogram(T, edges)[0]
     starts = edges[:-1][count > 300]
