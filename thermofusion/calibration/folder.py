@@ -16,6 +16,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,6 +29,7 @@ from ..errors import ScanError
 from ..scans.files import depth_from_raw, inside, read_image
 from ..types import Camera, Float, check_rigid
 from .board import Board
+from .thermal_source import RawLayout
 
 FILE = "calibration.json"
 SUFFIXES = ("png", "jpg", "tiff", "tif", "pgm", "raw")
@@ -130,11 +132,13 @@ class CalibrationFolder:
         r = self._config.thermal_raw
         if r is None:
             raise ScanError("a .raw picture needs its size", place=path, hint=f"give `thermal_raw` in {FILE}")
-        data = path.read_bytes()[r.header_bytes :]
-        if len(data) < 2 * r.width_px * r.height_px:
-            raise ScanError(f"{len(data)} bytes are too few for {r.width_px} x {r.height_px} px of 16 bit", place=path)
-        counts = np.frombuffer(data, ">u2" if r.big_endian else "<u2", r.width_px * r.height_px)
-        return counts.reshape(r.height_px, r.width_px).astype(np.uint16)
+        return RawLayout(r.width_px, r.height_px, r.big_endian, r.header_bytes).read(path)
+
+    @property
+    def newest(self) -> date:
+        """The day (UTC) on which the newest picture was written, by its file."""
+        times = [p.stat().st_mtime for files in self.files.values() for p in files.values()]
+        return datetime.fromtimestamp(max(times), UTC).date()
 
 
 def open_folder(

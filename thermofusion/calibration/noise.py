@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,14 +15,17 @@ from ..types import Float
 
 MIN_STILL_FRAMES = 8
 MIN_EDGE_ROWS = 12
+MIN_SLANT_PX = 1.0  # across all rows: an edge along the pixels is sampled at one phase only
+NETD_PIXELS = 20_000  # of a frame, evenly spread: more say nothing new and fill the memory
 
 
 @dataclass(frozen=True, eq=False)
 class StillNoise:
     """netd_K : temporal noise of a pixel (median over pixels, the frame's common drift taken off).
 
-    tau_s, allan_K : averaging times and Allan deviation of the image mean. drift_K_per_min : slope of the mean.
-    best_tau_s : averaging beyond this no longer helps, drift takes over.
+    tau_s, allan_K : averaging times and Allan deviation of the image mean, over the longest stretch without a gap.
+    drift_K_per_min : slope of the mean. best_tau_s : averaging beyond this no longer helps, drift takes over.
+    frames, duration_s : of the recording. even_frames : in that stretch.
     """
 
     netd_K: float
@@ -29,19 +33,43 @@ class StillNoise:
     tau_s: Float
     allan_K: Float
     best_tau_s: float
+    frames: int
+    duration_s: float
+    even_frames: int
 
 
-def still_noise(frames_degC: NDArray, times_s: NDArray) -> StillNoise:
-    """From frames (N, H, W) of a scene that does not move, at times (N,). Raises ScanError with fewer than 8 frames."""
-    x, t = np.asarray(frames_degC, np.float64), np.asarray(times_s, np.float64)
-    if len(x) < MIN_STILL_FRAMES:
-        raise ScanError(f"{len(x)} frames are too few for noise and drift", hint="record a still scene for a minute")
-    mean = np.nanmean(x, axis=(1, 2))
-    d = np.diff(x - mean[:, None, None], axis=0)  # differences: slow pixel drift falls out
-    netd = float(np.nanmedian(1.4826 * np.nanmedian(np.abs(d), axis=0))) / np.sqrt(2)
-    tau, allan = allan_deviation(mean, float(np.median(np.diff(t))))
+def still_noise(frames_degC: Iterable[NDArray], times_s: NDArray) -> StillNoise:
+    """From frames (H, W) of a scene that does not move, at times (N,); they are read one after the other.
+
+    Raises ScanError with fewer than 8 frames, or times that are not finite and rising.
+    """
+    means, some = [], []
+    for frame in frames_degC:
+        x = np.asarray(frame, np.float64)
+        means.append(np.nanmean(x))
+        some.append(x.ravel()[:: x.size // NETD_PIXELS + 1])
+    mean, t = np.array(means), np.asarray(times_s, np.float64)
+    if len(mean) < MIN_STILL_FRAMES:
+        raise ScanError(f"{len(mean)} frames are too few for noise and drift", hint="record a still scene for a minute")
+    if not (np.isfinite(t).all() and (np.diff(t) > 0).all()):
+        raise ScanError("the frames state no rising times", hint="give --rate, in frames a second")
+    d = np.diff(np.array(some) - mean[:, None], axis=0)  # differences: slow pixel drift falls out
+    measured = ~np.isnan(d).all(axis=0)
+    netd = float(np.median(1.4826 * np.nanmedian(np.abs(d[:, measured]), axis=0))) / np.sqrt(2)
+    even = _longest_even(t)
+    tau, allan = allan_deviation(mean[even], float(np.median(np.diff(t))))
     slope = float(np.polyfit((t - t.mean()) / 60, mean, 1)[0])
-    return StillNoise(netd, slope, tau, allan, float(tau[np.argmin(allan)]))
+    best = float(tau[np.argmin(allan)])
+    return StillNoise(netd, slope, tau, allan, best, len(t), float(t[-1] - t[0]), even.stop - even.start)
+
+
+def _longest_even(t: Float) -> slice:
+    """The longest stretch whose steps are all within half a step of the usual one (shutter frames leave gaps)."""
+    step = np.diff(t)
+    cuts = np.flatnonzero(np.abs(step / np.median(step) - 1) > 0.5) + 1
+    edges = np.concatenate([[0], cuts, [len(t)]])
+    k = int(np.argmax(np.diff(edges)))
+    return slice(int(edges[k]), int(edges[k + 1]))
 
 
 def allan_deviation(x: NDArray, step_s: float) -> tuple[Float, Float]:
@@ -94,6 +122,8 @@ def edge_spread(image: NDArray) -> EdgeSpread:
         slope, offset = np.polyfit(y[keep], place[keep], 1)
     if np.std((place - (slope * y + offset))[keep]) > 1.0:
         raise ScanError("the hot edge is not straight", hint="cut out a part with one straight edge")
+    if np.abs(slope) * np.ptp(y) < MIN_SLANT_PX:
+        raise ScanError("the hot edge runs along the pixels", hint="turn the edge by 3 to 10 degrees and record again")
     vv, uu = np.mgrid[0:h, 0:w]
     distance = (uu - slope * vv - offset) / np.hypot(1, slope)
     near = np.abs(distance) < min(12.0, w / 2)

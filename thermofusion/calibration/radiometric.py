@@ -6,7 +6,7 @@ is an error, not an extrapolation.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from math import comb
 
@@ -47,6 +47,17 @@ class RadiometricCurve:
             )
         return evaluate(self.kind, self.parameters, g)
 
+    def widened(self, share: float) -> RadiometricCurve:
+        """For pixels about a source at the range's end: the range wider by that share of it at both ends, or as it is
+        where the curve would turn."""
+        lo, hi = self.counts_range
+        wide = replace(self, counts_range=(lo - share * (hi - lo), hi + share * (hi - lo)))
+        try:
+            check_monotone(wide.kind, wide.parameters, wide.counts_range)
+        except ScanError:
+            return self
+        return wide
+
     def signal_curve(self) -> SignalCurve:
         """As scan.json carries it."""
         if self.kind == "polynomial":
@@ -66,10 +77,13 @@ def evaluate(kind: str, parameters: tuple[float, ...], counts: Float) -> Float:
         return B / np.log(R / (counts - O) + F) - ZERO_DEGC_K
 
 
-def fit_polynomial(counts: NDArray, degC: NDArray, *, degree: int = 4) -> RadiometricCurve:
+def fit_polynomial(
+    counts: NDArray, degC: NDArray, *, degree: int = 4, counts_range: tuple[float, float] | None = None
+) -> RadiometricCurve:
     """Eq. 1 from blackbody readings (N,). Fitted in a centred variable and expanded exactly (rational arithmetic).
 
-    Raises ScanError: too few readings, or a curve that turns inside its range (naming where).
+    counts_range : what the curve is for; by default, and at most, what was read.
+    Raises ScanError: too few readings, a range beyond them, or a curve that turns inside its range (naming where).
     """
     g, T = _readings(counts, degC, degree + 2)
     center, half = (g.max() + g.min()) / 2, (g.max() - g.min()) / 2
@@ -81,12 +95,14 @@ def fit_polynomial(counts: NDArray, degC: NDArray, *, degree: int = 4) -> Radiom
     curve = RadiometricCurve(
         "polynomial", _expand(c, center, half), (float(g.min()), float(g.max())), _rms(r), float(sigma)
     )
-    return _monotone(curve)
+    return _monotone(curve, counts_range)
 
 
-def fit_planck(counts: NDArray, degC: NDArray, *, fix_F: bool = True) -> RadiometricCurve:
+def fit_planck(
+    counts: NDArray, degC: NDArray, *, fix_F: bool = True, counts_range: tuple[float, float] | None = None
+) -> RadiometricCurve:
     """R, B, F, O from blackbody readings: S = R/(exp(B/T) - F) + O. F = 1 unless `fix_F` is False (it takes a wide
-    range of temperatures to tell F from B). Raises ScanError as `fit_polynomial`."""
+    range of temperatures to tell F from B). counts_range and errors as in `fit_polynomial`."""
     g, T = _readings(counts, degC, 5)
     K = T + ZERO_DEGC_K
     slope = (g[-1] - g[0]) / (K[-1] - K[0])
@@ -108,7 +124,8 @@ def fit_planck(counts: NDArray, degC: NDArray, *, fix_F: bool = True) -> Radiome
     parameters = (float(R), float(B), float(F), float(O))
     r = evaluate("planck", parameters, g) - T
     sigma = _rms(r) * np.sqrt(4 / max(len(g) - 3, 1))
-    return _monotone(RadiometricCurve("planck", parameters, (float(g.min()), float(g.max())), _rms(r), float(sigma)))
+    curve = RadiometricCurve("planck", parameters, (float(g.min()), float(g.max())), _rms(r), float(sigma))
+    return _monotone(curve, counts_range)
 
 
 def check_monotone(kind: str, parameters: tuple[float, ...], counts_range: tuple[float, float]) -> None:
@@ -126,7 +143,15 @@ def check_monotone(kind: str, parameters: tuple[float, ...], counts_range: tuple
         )
 
 
-def _monotone(curve: RadiometricCurve) -> RadiometricCurve:
+def _monotone(curve: RadiometricCurve, stated: tuple[float, float] | None) -> RadiometricCurve:
+    lo, hi = curve.counts_range
+    if stated is not None:
+        if not lo <= stated[0] < stated[1] <= hi:
+            raise ScanError(
+                f"the range {stated[0]:.0f} to {stated[1]:.0f} counts goes beyond the readings, {lo:.0f} to {hi:.0f}",
+                hint="take readings that enclose the range",
+            )
+        curve = replace(curve, counts_range=stated)
     check_monotone(curve.kind, curve.parameters, curve.counts_range)
     return curve
 
@@ -168,8 +193,11 @@ class PixelField:
     z: NDArray[np.float32]
 
     def correct(self, degC: NDArray) -> Float:
-        """Temperatures (H, W) with the field taken off."""
+        """Temperatures (H, W) with the field taken off. Raises ScanError if the picture has another size."""
         T = np.asarray(degC, np.float64)
+        if T.shape != self.z.shape[1:]:
+            (h, w), (fh, fw) = T.shape, self.z.shape[1:]
+            raise ScanError(f"the pixel field is of {fw} x {fh} px, the picture of {w} x {h}")
         deviation = np.zeros_like(T)
         for z in self.z[::-1]:
             deviation = deviation * T + z

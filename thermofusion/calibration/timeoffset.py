@@ -6,6 +6,7 @@ The right offset is the one at which a simple linear relation fits best; the rig
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from ..errors import ScanError
-from ..types import Camera, Float
+from ..types import Camera, Float, Scan
 
 MIN_SAMPLES = 12
 MIN_TRAVEL_PX = 15.0
@@ -25,14 +26,38 @@ OBJECT_THICKNESS_M = 0.08
 class TimeOffset:
     """offset_s is added to a thermal frame's own time to get the depth clock's time (scan.json `time_offset_s`).
 
-    sigma_s : one sigma. residual_px : rms of the thermal track at the best offset. tried_s, cost_px : the search.
+    sigma_s : one sigma. residual_px : rms of the thermal track at the best offset. frames : thermal frames used.
+    tried_s, cost_px : the search.
     """
 
     offset_s: float
     sigma_s: float
     residual_px: float
+    frames: int
     tried_s: Float
     cost_px: Float
+
+
+def scan_time_offset(
+    scan: Scan, *, max_offset_s: float = 0.5, progress: Callable[[str, int, int], None] = lambda *_: None
+) -> TimeOffset:
+    """From a recording of something warm, nearer to the depth camera than all else, waved before both cameras.
+
+    The whole offset from the thermal frames' own times, whatever the scan's `time_offset_s` says. Raises ScanError:
+    no thermal frames, or as `estimate_time_offset`.
+    """
+    if scan.thermal is None:
+        raise ScanError("the recording has no thermal frames", place=scan.root)
+    depth, thermal = scan.depth, scan.thermal
+    near = np.full((len(depth), 3), np.nan)
+    for i in np.flatnonzero(depth.usable).tolist():
+        near[i] = nearest_centroid(depth.load(i), scan.rig.depth)
+        progress("depth", i + 1, len(depth))
+    warm = np.full((len(thermal), 2), np.nan)
+    for i in np.flatnonzero(thermal.usable).tolist():
+        warm[i] = warm_centroid(thermal.load(i))
+        progress("thermal", i + 1, len(thermal))
+    return estimate_time_offset(depth.times_s, near, thermal.times_s, warm, max_offset_s=max_offset_s)
 
 
 def estimate_time_offset(
@@ -89,7 +114,7 @@ def estimate_time_offset(
     floor = max(float(c - b * b / (4 * a)), 1e-12)
     # cost = mean of two coordinates' squares, of M points less 8 fitted numbers
     sigma = float(np.sqrt(floor / (2 * max(len(tt) - 4, 1)) / a))
-    return TimeOffset(offset, sigma, float(np.sqrt(floor)), tried, np.sqrt(costs))
+    return TimeOffset(offset, sigma, float(np.sqrt(floor)), len(tt), tried, np.sqrt(costs))
 
 
 def warm_centroid(thermal: NDArray, *, share: float = 0.5) -> Float:

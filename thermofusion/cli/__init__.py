@@ -18,7 +18,7 @@ import typer
 
 from .. import __version__
 from ..errors import ThermofusionError
-from . import calibrate, inspect, judge, paper, process, recordings
+from . import calibrate, inspect, judge, paper, process, recordings, thermal
 from .console import fail
 
 INTERRUPTED = 130
@@ -31,7 +31,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (process, inspect, recordings, judge, calibrate, paper):
+for group in (process, inspect, recordings, judge, calibrate, thermal, paper):
     group.register(app)
 
 

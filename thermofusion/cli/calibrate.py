@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated
 
@@ -25,15 +26,30 @@ def calibrate(
     out: Annotated[Path, typer.Option("-o", "--out", help="Rig file to write.")] = Path("rig.json"),
     picks: Annotated[Path | None, typer.Option(help="Points picked by hand: CSV or picks.mat.")] = None,
     report: Annotated[Path | None, typer.Option(help="Report to write; beside the rig by default.")] = None,
+    date: Annotated[str | None, typer.Option(help="ISO 8601; by default the day of the newest picture.")] = None,
+    curve: Annotated[Path | None, typer.Option(help="curve.json of `thermal curve`: what the counts mean.")] = None,
+    time_offset_s: Annotated[
+        float | None, typer.Option("--time-offset-s", min=-3600, max=3600, help="Of `thermal time-offset`.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Cameras and rig from pictures of a board: rig.json with covariances, and a report."""
     from ..calibration import calibrate as solve
     from ..calibration import report_html, rig_document, write_rig
+    from ..calibration.blackbody import read_curve
     from ..rundir import write_text
 
+    day, radiometry = _day(date), None if curve is None else read_curve(curve)
     done = solve(folder, picks=picks, progress=(lambda _: None) if json else note)
-    document = rig_document(done.calibration, advice=done.advice)
+    document = rig_document(
+        done.calibration,
+        date=day or done.folder.newest.isoformat(),
+        curve=None if radiometry is None else radiometry.signal_curve(),
+        time_offset_s=time_offset_s,
+        advice=done.advice,
+    )
+    if radiometry is not None:
+        document["radiometry"] = {k: getattr(radiometry, k) for k in ("counts_range", "residual_K", "sigma_K")}
     write_rig(out, document)
     names = [(c, v.name) for v in done.calibration.data.views for c in v.points][:PICTURES_IN_REPORT]
     pictures = {f"{camera} {name}": done.picture(camera, name) for camera, name in names if camera != "depth"}
@@ -43,6 +59,16 @@ def calibrate(
     lines += [f"note     {text}" for text in done.calibration.notes]
     lines += [f"next     {text}" for text in done.advice]
     emit(document, "\n".join([*lines, f"wrote {out} and {page}"]), json)
+
+
+def _day(text: str | None) -> str | None:
+    """An ISO 8601 date or time as it was given, checked."""
+    try:
+        if text is not None:
+            datetime.fromisoformat(text)
+        return text
+    except ValueError:
+        raise RecipeError(f"--date needs ISO 8601, like 2026-05-04, got '{text}'") from None
 
 
 def board(

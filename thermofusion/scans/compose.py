@@ -12,7 +12,7 @@ from ..errors import ScanError
 from ..types import Camera, Rig, Scan, SignalCurve, ThermalSensor
 from .common import make_rig, make_stream
 from .files import read_json
-from .schema import RigDoc, camera_of, matrix_of, sensor_of, validate
+from .schema import RigDoc, RigThermalDoc, camera_of, matrix_of, sensor_of, validate
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,10 +60,20 @@ def with_rig(scan: Scan, path: str | Path) -> Scan:
         rows = getattr(doc.extrinsics, key)
         if rows is not None and parts[key.split("_")[1]] is not None:
             parts[key] = matrix_of(rows, f"extrinsics.{key}", path)
-    thermal = doc.cameras.thermal
-    sensor = sensor_of(thermal, path) if thermal is not None and scan.thermal is not None else scan.sensor
+    sensor = _sensor(scan, doc.cameras.thermal, path)
     rig = make_rig(**parts, place=path)  # type: ignore[arg-type]
     return replace(scan, rig=rig, sensor=sensor, notes=(*scan.notes, f"cameras and extrinsics from {path.name}"))
+
+
+def _sensor(scan: Scan, group: RigThermalDoc | None, path: Path) -> ThermalSensor | None:
+    """The scan's radiometry with what the rig names in its place."""
+    if group is None or scan.thermal is None:
+        return scan.sensor
+    stated = sensor_of(group, path)
+    if scan.sensor is None:
+        return None if group.signal is None else stated
+    named = group.model_fields_set - ({"signal"} if group.signal is None else set())
+    return replace(stated, **{k: v for k, v in vars(scan.sensor).items() if k not in named})
 
 
 def with_thermal(

@@ -129,12 +129,18 @@ class ScanDoc(Border):
     notes: list[str] = []
 
 
+class RigThermalDoc(ThermalCameraDoc):
+    """The thermal camera of a rig.json: boards alone tell no curve."""
+
+    signal: SignalDoc | None = None  # type: ignore[assignment]
+
+
 class RigCamerasDoc(Border):
     """`cameras` of a rig.json, each optional."""
 
     depth: DepthCameraDoc | None = None
     color: CameraDoc | None = None
-    thermal: ThermalCameraDoc | None = None
+    thermal: RigThermalDoc | None = None
 
 
 class RigDoc(Border):
@@ -203,6 +209,8 @@ def sensor_of(doc: ThermalCameraDoc, path: Path) -> ThermalSensor:
         raise ScanError(
             f"key 'cameras.thermal.band_um': expected two rising wavelengths in 1-30 um, got {lo}, {hi}", place=path
         )
+    if doc.signal is None:  # of a rig.json
+        return ThermalSensor(SignalCurve(), doc.band_um, doc.netd_K, doc.time_offset_s, doc.psf_sigma_px)
     signal = SignalCurve(doc.signal.kind)
     if doc.signal.kind == "counts":
         if doc.signal.curve is None:

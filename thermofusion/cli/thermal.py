@@ -1,0 +1,278 @@
+"""The verbs `thermal …`: the thermal camera by itself. What counts mean, how even, quiet, sharp and late it is."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ..errors import RecipeError, ScanError
+from .console import Progress, emit, progress
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from ..calibration.blackbody import Box
+    from ..calibration.radiometric import RadiometricCurve
+    from ..calibration.thermal_source import RawLayout, ThermalSource
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+Readings = Annotated[Path, typer.Argument(help="CSV: counts,degC, or file,degC[,left_px,top_px,width_px,height_px].")]
+Source = Annotated[Path, typer.Argument(help="A scan, a FLIR recording, a folder of pictures, or a picture.")]
+Curve = Annotated[Path | None, typer.Option(help="curve.json; by default the recording's own curve.")]
+Raw = Annotated[
+    str | None, typer.Option("--raw", metavar="WxH[,big][,skip=BYTES]", help="Layout of .raw files of 16-bit counts.")
+]
+
+FIELD_MARGIN = 0.1  # of the curve's range: vignetting and noise about a source at its end
+
+verbs = typer.Typer(
+    help="The thermal camera by itself: curve, field, flatten, noise, edge, time-offset.", no_args_is_help=True
+)
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's verbs."""
+    app.add_typer(verbs, name="thermal")
+
+
+@verbs.command()
+def curve(
+    readings: Readings,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Curve file to write.")] = Path("curve.json"),
+    model: Annotated[str, typer.Option(help="polynomial (the paper's Eq. 1) or planck.")] = "polynomial",
+    degree: Annotated[int, typer.Option(min=1, max=6, help="Of the polynomial.")] = 4,
+    free_F: Annotated[
+        bool, typer.Option("--free-f", help="Planck: fit F too; takes a wide temperature range.")
+    ] = False,
+    range_: Annotated[
+        str | None, typer.Option("--range", help="Counts the curve is for, low:high; all readings by default.")
+    ] = None,
+    raw: Raw = None,
+    json: Json = False,
+) -> None:
+    """Counts to °C from blackbody readings; refused where the curve would turn."""
+    import numpy as np
+
+    from ..calibration.blackbody import curve_document, read_readings, reading_counts, write_curve
+    from ..calibration.radiometric import fit_planck, fit_polynomial
+
+    if model not in ("polynomial", "planck"):
+        raise RecipeError(f"there is no model '{model}'", hint="choose polynomial or planck")
+    limits = None if range_ is None else _range(range_)
+    table = read_readings(readings)
+    counts, degC = reading_counts(table, _opener(raw)), np.array([r.degC for r in table])
+    try:
+        if model == "planck":
+            fitted = fit_planck(counts, degC, fix_F=not free_F, counts_range=limits)
+        else:
+            fitted = fit_polynomial(counts, degC, degree=degree, counts_range=limits)
+    except ScanError as e:
+        raise ScanError(e.cause, place=readings, hint=e.hint) from None
+    document = curve_document(fitted, len(table))
+    write_curve(out, document)
+    (lo, hi), (cold, warm) = document["counts_range"], document["degC_range"]
+    text = (
+        f"{model} from {len(table)} readings, for {lo:.0f} to {hi:.0f} counts ({cold:.2f} to {warm:.2f} °C)\n"
+        f"residual {fitted.residual_K * 1e3:.2f} mK rms; the curve itself is good to {fitted.sigma_K * 1e3:.2f} mK\n"
+        f"wrote {out}"
+    )
+    emit(document, text, json)
+
+
+@verbs.command()
+def field(
+    readings: Readings,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Field file to write.")] = Path("field.npz"),
+    curve: Curve = None,
+    degree: Annotated[int, typer.Option(min=0, max=4, help="Power of temperature each pixel's error follows.")] = 1,
+    raw: Raw = None,
+    json: Json = False,
+) -> None:
+    """Vignetting and offsets of every pixel, from pictures that a uniform source fills."""
+    import numpy as np
+
+    from ..calibration.blackbody import read_readings, write_field
+    from ..calibration.radiometric import fit_field
+
+    table, opener, chosen = read_readings(readings), _opener(raw), _curve(curve)
+    chosen = chosen and chosen.widened(FIELD_MARGIN)
+    if any(r.file is None or r.box is not None for r in table):
+        raise ScanError("a field needs pictures that the source fills: rows file,degC without a box", place=readings)
+    frames = [opener(r.file).mean_degC(chosen) for r in table if r.file is not None]
+    if len({f.shape for f in frames}) > 1:
+        raise ScanError("the pictures differ in size", place=readings)
+    degC = np.array([r.degC for r in table])
+    found = fit_field(np.stack(frames), degC, degree=degree)
+    write_field(out, found)
+    before, after = (float(np.mean([np.nanstd(f) for f in fs])) for fs in (frames, map(found.correct, frames)))
+    h, w = frames[0].shape
+    value = {"field": out, "width_px": w, "height_px": h, "degree": degree, "uneven_K": before, "left_K": after}
+    text = f"{w} x {h} px: the source looks uneven by {before * 1e3:.1f} mK (one sigma), {after * 1e3:.1f} mK are left"
+    emit(value, f"{text}\nwrote {out}", json)
+
+
+@verbs.command()
+def flatten(
+    source: Source,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Scan folder, or folder of float32 TIFF in °C, to write.")],
+    field: Annotated[Path | None, typer.Option(help="Field file; without it, only counts become °C.")] = None,
+    curve: Curve = None,
+    raw: Raw = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")] = False,
+    json: Json = False,
+) -> None:
+    """Pictures, or a whole scan, as apparent °C with the pixel field taken off."""
+    import numpy as np
+
+    from ..calibration.blackbody import read_field
+    from ..calibration.flatten import flat, flatten_scan, write_flat
+
+    pixel_field, chosen, frames = None if field is None else read_field(field), _curve(curve), _opener(raw)(source)
+    before, after = (float(np.nanstd(flat(frames, 0, f, chosen))) for f in (None, pixel_field))
+    if frames.scan is not None:
+        flatten_scan(frames, out, pixel_field, chosen, overwrite=overwrite)
+    else:
+        write_flat(frames, out, pixel_field, chosen, overwrite=overwrite)
+    value = {"written": out, "frames": len(frames), "before_K": before, "after_K": after}
+    text = f"{len(frames)} frames; the first spreads over {before:.3f} K, now over {after:.3f} K (one sigma)"
+    emit(value, f"{text}\nwrote {out}", json)
+
+
+@verbs.command()
+def noise(
+    source: Source,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Allan-type plot to write: .svg.")] = None,
+    curve: Curve = None,
+    rate: Annotated[float | None, typer.Option(min=1e-3, help="Frames a second, where they state no times.")] = None,
+    raw: Raw = None,
+    json: Json = False,
+) -> None:
+    """NETD and drift from a recording of a scene that does not move."""
+    from ..calibration.noise import still_noise
+    from ..calibration.noise_plot import allan_svg
+    from ..rundir import write_text
+
+    if out is not None and out.suffix != ".svg":
+        raise RecipeError(f"the plot is written as .svg, not '{out.suffix}'", place=out)
+    frames, chosen = _opener(raw, rate)(source), _curve(curve)
+    try:
+        with progress(json) as step:
+            found = still_noise(_read(frames, chosen, step), frames.times_s)
+    except ScanError as e:
+        raise ScanError(e.cause, place=e.place or source, hint=e.hint) from None
+    if out is not None:
+        write_text(out, allan_svg(found))
+    text = (
+        f"NETD      {found.netd_K * 1e3:.1f} mK (netd_K in scan.json)\n"
+        f"drift     {found.drift_K_per_min:+.3f} K/min of the image mean\n"
+        f"averaging helps up to {found.best_tau_s:.3g} s; {found.frames} frames in {found.duration_s:.1f} s"
+    )
+    emit(found, text if out is None else f"{text}\nwrote {out}", json)
+
+
+@verbs.command()
+def edge(
+    source: Source,
+    box: Annotated[
+        str | None,
+        typer.Option(metavar="LEFT,TOP,WIDTH,HEIGHT", help="Part of the picture with one straight edge, px."),
+    ] = None,
+    curve: Curve = None,
+    raw: Raw = None,
+    json: Json = False,
+) -> None:
+    """Point spread from a straight, slightly slanted hot edge (the mean of all frames)."""
+    from ..calibration.noise import edge_spread
+
+    part = None if box is None else _box(box)
+    image, unit = _opener(raw)(source).mean_shown(_curve(curve))
+    try:
+        found = edge_spread(image if part is None else part.cut(image))
+    except ScanError as e:
+        raise ScanError(e.cause, place=source, hint=e.hint) from None
+    text = (
+        f"point spread {found.sigma_px:.3f} ± {found.sigma_sigma_px:.3f} px, one sigma (psf_sigma_px in scan.json)\n"
+        f"edge {found.contrast:.1f} {'K' if unit == 'degC' else unit} high, slanted by {found.angle_deg:+.1f}°"
+    )
+    emit({**vars(found), "contrast_unit": unit}, text, json)
+
+
+@verbs.command("time-offset")
+def time_offset(
+    scan: Annotated[Path, typer.Argument(help="Something warm, nearest to the cameras, waved for ten seconds.")],
+    format: Annotated[str | None, typer.Option(help="Format of the recording; recognised by default.")] = None,
+    max_s: Annotated[float, typer.Option("--max-s", min=0.05, max=10, help="Largest offset looked for.")] = 0.5,
+    json: Json = False,
+) -> None:
+    """How late the thermal clock is: time_offset_s, from something warm that moves before both cameras."""
+    from ..calibration.timeoffset import scan_time_offset
+    from ..scans import open_scan
+
+    recording = open_scan(scan, format=format)
+    try:
+        with progress(json) as step:
+            found = scan_time_offset(recording, max_offset_s=max_s, progress=step)
+    except ScanError as e:
+        raise ScanError(e.cause, place=e.place or scan, hint=e.hint) from None
+    own = 0.0 if recording.sensor is None else recording.sensor.time_offset_s
+    value = {"time_offset_s": found.offset_s, "sigma_s": found.sigma_s, "residual_px": found.residual_px}
+    value |= {"thermal_frames": found.frames, "scan_time_offset_s": own}
+    text = (
+        f"time_offset_s {found.offset_s:+.4f} ± {found.sigma_s:.4f} s (one sigma), from {found.frames} thermal frames; "
+        f"residual {found.residual_px:.2f} px\nthe recording itself says {own:+.4f} s"
+    )
+    emit(value, text, json)
+
+
+# ---------------------------------------------------------------- what the options say
+
+
+def _opener(raw: str | None, rate_hz: float | None = None) -> Callable[[Path], ThermalSource]:
+    from ..calibration.thermal_source import open_thermal
+
+    layout = None if raw is None else _layout(raw)
+    return lambda path: open_thermal(path, raw=layout, rate_hz=rate_hz)
+
+
+def _curve(path: Path | None) -> RadiometricCurve | None:
+    from ..calibration.blackbody import read_curve
+
+    return None if path is None else read_curve(path)
+
+
+def _layout(text: str) -> RawLayout:
+    from ..calibration.thermal_source import RawLayout
+
+    found = re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})(,big)?(?:,skip=(\d{1,9}))?", text)
+    if found is None:
+        raise RecipeError(f"--raw needs WxH[,big][,skip=BYTES], got '{text}'", hint="for example 640x480,big,skip=240")
+    width, height, big, skip = found.groups()
+    return RawLayout(int(width), int(height), big is not None, int(skip or 0))
+
+
+def _box(text: str) -> Box:
+    from ..calibration.blackbody import Box
+
+    if re.fullmatch(r"\d{1,5}(,\d{1,5}){3}", text) is None:
+        raise RecipeError(f"--box needs LEFT,TOP,WIDTH,HEIGHT in pixels, got '{text}'")
+    return Box(*map(int, text.split(",")))
+
+
+def _range(text: str) -> tuple[float, float]:
+    try:
+        low, high = (float(x) for x in text.split(":"))
+    except ValueError:
+        raise RecipeError(f"--range needs low:high in counts, got '{text}'") from None
+    if not low < high:
+        raise RecipeError(f"--range needs low < high, got '{text}'")
+    return low, high
+
+
+def _read(frames: ThermalSource, curve: RadiometricCurve | None, step: Progress) -> Iterator[NDArray]:
+    for i in range(len(frames)):
+        yield frames.degC(i, curve)
+        step("frames", i + 1, len(frames))
