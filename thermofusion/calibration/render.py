@@ -30,7 +30,7 @@ class Pictures:
     """How the simulated cameras see.
 
     blur_px : one sigma of each lens. color_noise : grey levels. thermal_noise, thermal_pattern : counts, of every
-    picture and of the sensor's own columns and pixels. missing : share of pins that do not show.
+    picture and of the sensor's own columns and pixels. missing : share of pins that do not show. board_warmer : counts over the wall.
     """
 
     color_blur_px: float = 0.8
@@ -39,6 +39,7 @@ class Pictures:
     thermal_noise: float = 5.0
     thermal_pattern: float = 3.0
     missing: float = 0.1
+    board_warmer: float = 15.0
 
 
 @dataclass(frozen=True)
@@ -157,7 +158,7 @@ def thermal_picture(
     contrast = rng.uniform(100, 360, len(board)) * np.sign(np.tile(across, board.rows) + rng.normal(0, 0.3, len(board)))
     contrast[rng.random(len(board)) < look.missing] = 0
     pin = np.where((x - i) ** 2 + (y - j) ** 2 < PIN_RADIUS**2, contrast[j * board.columns + i], 0).astype(np.float32)
-    _paste(image, here, pin + 60, _on_board(rig, x, y), look.thermal_blur_px)
+    _paste(image, here, pin + np.float32(look.board_warmer), _on_board(rig, x, y), look.thermal_blur_px)
     noise = rng.standard_normal(image.shape, np.float32) * np.float32(look.thermal_noise)
     return np.round(24_200 + image + pattern + noise).astype(np.uint16)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import product
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..errors import ScanError
 from ..types import Float
+from .board import Board
 from .bundle import Options, Problem
 from .cameras import from_rt, project_with_jacobian
 from .detect_thermal import (
@@ -119,8 +121,28 @@ def _first(
         q = _turned(shape, choice[1]) * choice[0] * size[0] + np.array(size) / 2
         spots = pictures.spots(n, step_px(q))
         shift, _ = find_shift(spots, q, 0.25 * size[0], dilate_px=4)
-        out[n] = complete(spots, q + shift)
+        out[n] = _unshifted(complete(spots, q + shift), spots, q + shift, data.board)
     return out
+
+
+def _unshifted(found: Detection, spots: NDArray[np.float32], q: Float, board: Board) -> Detection:
+    """The detection, or that of a grid one row or column further if it lies on more spots: a board's edge can pass for
+    a row of pins. Again from there, until no neighbour is better."""
+    best = None
+    while best is not found:
+        best = found
+        grid = (found.tried if found.score > 0 else q).reshape(board.rows, board.columns, 2)
+        for across, down in product((-1, 0, 1), repeat=2):
+            moved = _stepped(_stepped(grid, across, axis=1), down, axis=0)
+            found = max(found, complete(spots, moved.reshape(-1, 2)), key=lambda d: d.score)
+    return found
+
+
+def _stepped(grid: Float, step: int, axis: int) -> Float:
+    """A grid (rows, columns, 2) laid one point further, the new line by extrapolation."""
+    g = np.moveaxis(grid, axis, 0)[:: step or 1]
+    g = np.concatenate([g[1:], 2 * g[-1:] - g[-2:-1]]) if step else g
+    return np.moveaxis(g[:: step or 1], 0, axis)
 
 
 def _predicted(
