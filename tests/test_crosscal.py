@@ -133,6 +133,24 @@ def test_a_blackbody_sets_the_level_hard():
         assert c.level_sigma_K >= c.reference_sigma_K
 
 
+def test_a_blackbody_beside_the_body_is_read_with_the_nearest_known_field():
+    """In a corner where no skin was seen: the dark corner goes into the level only as far as the stated sigma says."""
+    world = make_world(2)
+    seen = replace(world, observations=world.observations.select(world.observations.u_px < 200))
+    errors_K = []
+    for u in (195.0, 230.0, 310.0):
+        c = calibrate(seen, blackbodies=blackbodies(world, u=u, v=120.0))
+        error = float(np.nanmedian(temperatures(seen, c, observations=seen.observations).absolute_K - world.T_K))
+        errors_K.append(abs(error) / c.reference_sigma_K)
+        away = max(u - 200, 0) / WIDTH
+        assert c.reference_sigma_K == pytest.approx(np.hypot(0.03, 0.3 * min(away / 0.25, 1)), abs=0.025)
+    assert max(errors_K) < 2
+    budget = temperatures(seen, c, observations=seen.observations).uncertainty
+    known = np.isfinite(budget.total_K)
+    assert (budget.absolute_K[known] >= c.reference_sigma_K * 0.99).all()
+    assert np.nanmedian(budget.total_K) < 0.1 < np.nanmedian(budget.absolute_K)
+
+
 def test_a_contact_thermometer_sets_the_level():
     world = make_world(3)
     spot = np.argsort(np.linalg.norm(world.points_m - [0.18, 0, 0], axis=1))[:8].astype(np.int32)

@@ -23,7 +23,7 @@ from scipy.sparse.csgraph import connected_components
 from .emissivity import AngleTable, EmissivityModel, reshaped, shape_direction
 from .errors import ScanError
 from .imagefield import ImageField
-from .overlap import SHAPE_BOUNDS, ContactRow, OverlapSystem, Solution, condition_number
+from .overlap import SHAPE_BOUNDS, ContactRow, KnownField, OverlapSystem, Solution, condition_number
 from .radiometry import Band
 from .recipe import CrosscalSection
 from .references import BlackbodyReading, ContactReading
@@ -34,7 +34,11 @@ FIELD_HELD = 0.7  # of the prior's sigma: a pattern of the field less certain th
 SHAPE_HELD = 0.5  # a shape less certain than half the way between the skin presets is held
 GAIN_SPAN_K = 3.0  # references must differ by this much to carry a gain
 ROWS_PER_VERTEX = 20  # bound on the system: max_vertices x this many observations
-SUPPORT_RADIUS, SUPPORT_ROWS, SUPPORT_VIEWS = 0.1, 200, 3  # skin near a blackbody: in image widths, rows, views
+SUPPORT_CELLS, SUPPORT_ROWS, SUPPORT_VIEWS = (
+    24,
+    25,
+    3,
+)  # across the image; the field is known in cells with so much skin
 MIN_SHARED = 20  # vertices that two views must share to count as overlapping
 ERROR_RASTER = 32  # cells along each side on which the field's error is evaluated
 
@@ -227,14 +231,27 @@ def _system(
         readings=tuple(blackbodies),
         reading_groups=tuple(r.view if settings.offsets else 0 for r in blackbodies),
         contacts=tuple(contact_rows),
-        reading_supported=tuple(_skin_near(rows, r, image_size[0]) for r in blackbodies),
+        reading_places=tuple(_field_known_at(rows, r, image_size) for r in blackbodies),
     )
 
 
-def _skin_near(rows: Observations, reading: BlackbodyReading, width_px: int) -> bool:
-    """Whether skin was seen around a reading's place in the image: only there is the field known."""
-    near = np.hypot(rows.u_px - reading.u_px, rows.v_px - reading.v_px) < SUPPORT_RADIUS * width_px
-    return int(near.sum()) >= SUPPORT_ROWS and len(np.unique(rows.view[near])) >= SUPPORT_VIEWS
+def _field_known_at(rows: Observations, reading: BlackbodyReading, image_size: tuple[int, int]) -> KnownField:
+    """The place nearest to a reading at which skin was seen, so that the field is known: the reading's own, mostly."""
+    width, height = image_size
+    side = width / SUPPORT_CELLS
+    across, down = SUPPORT_CELLS, int(np.ceil(height / side))
+    cell = np.clip((rows.v_px / side).astype(np.int64), 0, down - 1) * across
+    cell += np.clip((rows.u_px / side).astype(np.int64), 0, across - 1)
+    count = np.bincount(cell, minlength=across * down)
+    views = np.unique(cell * (int(rows.view.max(initial=0)) + 1) + rows.view) // (int(rows.view.max(initial=0)) + 1)
+    good = (count >= SUPPORT_ROWS) & (np.bincount(views, minlength=across * down) >= SUPPORT_VIEWS)
+    if not good.any():
+        return KnownField(reading.u_px, reading.v_px, np.inf)
+    v, u = np.divmod(np.flatnonzero(good), across)
+    du = np.clip(reading.u_px, u * side, (u + 1) * side) - reading.u_px
+    dv = np.clip(reading.v_px, v * side, (v + 1) * side) - reading.v_px
+    k = int(np.argmin(np.hypot(du, dv)))
+    return KnownField(reading.u_px + float(du[k]), reading.v_px + float(dv[k]), float(np.hypot(du[k], dv[k])) / width)
 
 
 def _contact_rows(

@@ -21,7 +21,7 @@ HUBER_STEPS, TUKEY_STEPS = 4, 40
 CONVERGED_K = 2e-5
 OFFSET_PRIOR_K = 5.0  # spread of offsets about their mean: only matters for views that overlap with none
 FIELD_PRIOR_K = {1: 0.15, 2: 0.15, 3: 0.07, 4: 0.07}  # rms of a field pattern by polynomial order; 0.1-0.3 K together
-FIELD_UNKNOWN_K = 0.3  # one sigma of the field where no skin was seen
+FIELD_UNKNOWN_K, FIELD_MEMORY = 0.3, 0.25  # one sigma of the field's change over this share of the image width
 SHAPE_PRIOR = 2.0
 SHAPE_BOUNDS = (-2.0, 5.0)
 GAIN_PRIOR = 0.1
@@ -53,6 +53,20 @@ class Level:
     variance: float
 
 
+@dataclass(frozen=True)
+class KnownField:
+    """The place at which the field is read for a reference: its own, or the nearest at which skin was seen. A polynomial
+    says nothing beyond its data: there the field is held, and less certain with the distance `away` [image widths]."""
+
+    u_px: float
+    v_px: float
+    away: float = 0.0
+
+    @property
+    def sigma_K(self) -> float:
+        return FIELD_UNKNOWN_K * min(self.away / FIELD_MEMORY, 1.0)
+
+
 @dataclass(frozen=True, eq=False)
 class ContactRow:
     """Vertices around a contact thermometer: their mean x should be `expected`."""
@@ -68,8 +82,7 @@ class OverlapSystem:
 
     x holds the camera's gain 1 + γ. columns : (N, K + 2): field patterns, D·x of the last step, L_r - pivot.
     group : (N,) the offset's index. keep : (K_all, K) combinations of the field's patterns that are solved for.
-    order, start : rows by vertex. reading_supported : whether skin was seen near a reading's place in the image; where
-    it was not, the field is not known and not extrapolated. correlated : how many vertices err alike (neighbours share
+    order, start : rows by vertex. reading_places : where the field is taken for each reading. correlated : how many vertices err alike (neighbours share
     their normal, and all share rig and shape): the data's information is divided by it where it meets other knowledge.
     """
 
@@ -92,7 +105,7 @@ class OverlapSystem:
     readings: tuple[BlackbodyReading, ...]
     reading_groups: tuple[int, ...]
     contacts: tuple[ContactRow, ...]
-    reading_supported: tuple[bool, ...] = ()
+    reading_places: tuple[KnownField, ...] = ()
     correlated: float = 1.0
 
     @property
@@ -230,24 +243,26 @@ class OverlapSystem:
         """Each reading with its derivative by the parameters and its weight."""
         M, K, P = self.sizes
         out = []
-        supported = self.reading_supported or (True,) * len(self.readings)
-        for reading, group, known in zip(self.readings, self.reading_groups, supported, strict=True):
+        for reading, group, place in zip(self.readings, self.reading_groups, self._places(), strict=True):
             row = np.zeros(P)
             row[group] = 1.0
-            if known:
-                at = self.field.patterns(np.array([reading.u_px]), np.array([reading.v_px]))
+            if np.isfinite(place.away):
+                at = self.field.patterns(np.array([place.u_px]), np.array([place.v_px]))
                 row[M : M + K] = (at @ self.keep)[0]
             row[-1] = reading.expected - self.pivot if self.use_gain else 0.0
             out.append((reading, row, 1 / (reading.sigma_measured**2 + (READING_FLOOR_K * self.slope_L) ** 2)))
         return out
 
+    def _places(self) -> tuple[KnownField, ...]:
+        return self.reading_places or tuple(KnownField(r.u_px, r.v_px) for r in self.readings)
+
     def _mean_reading(self) -> Level:
         rows = self._reading_rows()
         w = np.array([weight for _, _, weight in rows])
         variance = 1 / w.sum() + max(r.sigma_expected for r in self.readings) ** 2
-        if self.keep.shape[1] and not all(self.reading_supported):
-            variance += (FIELD_UNKNOWN_K * self.slope_L) ** 2
         w /= w.sum()
+        if self.keep.shape[1]:
+            variance += (self.slope_L * sum(wi * p.sigma_K for wi, p in zip(w, self._places(), strict=True))) ** 2
         row = np.sum([wi * row for wi, (_, row, _) in zip(w, rows, strict=True)], axis=0)
         target = np.sum([wi * (r.measured - r.expected) for wi, r in zip(w, self.readings, strict=True)])
         return Level(row, float(target), float(variance))

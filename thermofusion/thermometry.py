@@ -50,7 +50,7 @@ DEFAULT_ROOM_DEGC = 23.0  # taken, and said, where neither scan nor recipe knows
 DEFAULT_SIGMA_NORMAL_DEG = 2.0  # of normals over a 25 mm window of a Kinect's surface
 CAVITY_FRACTION = 0.2  # of the hemisphere: beyond it reflection between body parts exceeds 0.1 K
 HIGH_RESIDUAL = 3.0  # views disagree by more than this many of their own sigmas: hair, clothes, motion
-UNCERTAINTY_MEANS = "one sigma about the common level; the level's own parts are listed apart"
+UNCERTAINTY_MEANS = "one sigma about the level common to all vertices; _absolute, where the level is known: with it"
 CONTACT_RADIUS_M, CONTACT_FAR_M = 0.006, 0.03
 
 
@@ -383,18 +383,22 @@ def _mesh(
     flags[np.nan_to_num(result.residual) > HIGH_RESIDUAL] |= np.uint8(VertexFlag.HIGH_RESIDUAL)
     if body_fraction is not None:
         flags[body_fraction > CAVITY_FRACTION] |= np.uint8(VertexFlag.CAVITY)
+    anchored = calibration is not None and calibration.anchored
+    parts = dict(result.uncertainty.parts_K)
+    if anchored:
+        parts["absolute"] = result.uncertainty.absolute_K
     return ThermalMesh(
         surface=surface,
         temperature_degC=_degC(result.temperature_K),
         mode=result.output,
-        anchored=calibration is not None and calibration.anchored,
+        anchored=anchored,
         apparent_degC=_degC(result.apparent_K),
         uncertainty_K=result.uncertainty.total_K,
         view_angle_deg=result.best_angle_deg,
         distance_m=result.distance_m,
         observations=result.count,
         flags=flags,
-        uncertainty_parts=result.uncertainty.parts_K,
+        uncertainty_parts=parts,
         metadata=_metadata(recipe, axes)
         | {"scan": scan.name, "uncertainty": UNCERTAINTY_MEANS}
         | {f"level_sigma_K_{k}": v for k, v in result.uncertainty.level_parts_K.items() if np.isfinite(v)},

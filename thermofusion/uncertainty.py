@@ -149,6 +149,13 @@ class Uncertainty:
         return cls(total.astype(np.float32), parts, {k: abs(v) for k, v in level.items()}, common)
 
     @property
+    def absolute_K(self) -> Float32:
+        """(V,) one sigma of a single vertex's temperature on an absolute scale: all parts, and all of what is common."""
+        own = {name: value for name, value in self.parts_K.items() if name not in self.common_K}
+        squares = [v.astype(np.float64) ** 2 for v in (*own.values(), *self.common_K.values())]
+        return np.sqrt(np.sum(squares, axis=0)).astype(np.float32)
+
+    @property
     def level_K(self) -> float:
         """One sigma of the common level."""
         return float(np.sqrt(sum(v**2 for v in self.level_parts_K.values())))
