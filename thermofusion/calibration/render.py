@@ -1,4 +1,4 @@
-"""Pictures of a simulated rig: a whole calibration folder with known truth, to go through the real readers and detectors.
+"""Pictures of a simulated rig: a calibration folder with known truth, to go through the real readers and detectors.
 
 Every picture is evaluated where the camera's true, distorted rays meet the board, on a grid finer than the pixels,
 blurred by the lens, averaged over the pixel, and made noisy. Nothing in it knows how detectors work.
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..geometry import invert, undistort
 from ..types import Camera, Float
+from .board import Board
 from .simulate import SimulatedRig, board_poses, true_pixels
 
 FINE = 4  # samples per pixel and axis
@@ -27,10 +28,11 @@ PIN_RADIUS = 0.05  # spacings
 
 @dataclass(frozen=True)
 class Pictures:
-    """How the simulated cameras see.
+    """How the simulated colour and thermal cameras see.
 
     blur_px : one sigma of each lens. color_noise : grey levels. thermal_noise, thermal_pattern : counts, of every
-    picture and of the sensor's own columns and pixels. missing : share of pins that do not show. board_warmer : counts over the wall.
+    picture and of the sensor's own columns and pixels. missing : share of pins that do not show. board_warmer : counts
+    over the wall.
     """
 
     color_blur_px: float = 0.8
@@ -46,12 +48,12 @@ class Pictures:
 class Kinect:
     """A structured-light depth camera.
 
-    step_m, noise_m : a count of disparity and one sigma of noise before rounding to it, m at 1 m (both grow as range²:
-    1/8 px of a 75 mm base; together 1.4 mm at 1 m as in Khoshelham & Elberink 2012). common : share of the noise's variance that neighbours within the matching window
-    have in common. window_px : one sigma of that window. ragged_px, grown_px : one sigma of an edge's wandering, and how
-    far foreground spreads over background. bend_m : bowl of the depth over the image, m at 1 m. scale, offset_m : of
-    reported against true depth. lost, dark_lost : share of pixels without depth, and of those on dark squares.
-    projector_m : base; what it does not reach behind the board is lost.
+    step_m, noise_m : a count of disparity, and one sigma of noise before it is rounded to one, m at 1 m; both grow as
+    range² (1/8 px of a 75 mm base; together 1.4 mm at 1 m as in Khoshelham & Elberink 2012). common : share of the
+    noise's variance that neighbours within the matching window have in common. window_px : one sigma of that window.
+    ragged_px, grown_px : one sigma of an edge's wandering, and how far foreground spreads over background. bend_m :
+    bowl of the depth over the image, m at 1 m. scale, offset_m : of reported against true depth. lost, dark_lost :
+    share of pixels without depth, and of those on dark squares. projector_m : base; what it cannot reach is lost.
     """
 
     step_m: float = 2.85e-3
@@ -81,8 +83,8 @@ def write_folder(
 ) -> list[Float]:
     """A calibration folder of a simulated afternoon; returns the true T_depth_board of its views.
 
-    lens_known : calibration.json gives the true depth lens as the maker's calibration; otherwise a data sheet's, that is
-    off by 1 % in focal length. board_margin_m : stated there too.
+    lens_known : calibration.json gives the true depth lens as the maker's calibration; otherwise a data sheet's, 1 %
+    off in focal length. board_margin_m : stated there too.
     """
     pictures, kinect = pictures or Pictures(), kinect or Kinect()
     rng = np.random.default_rng(seed)
@@ -129,6 +131,8 @@ def color_picture(rig: SimulatedRig, T_depth_board: Float, seed: int, look: Pict
     gx, gy = (np.float32(g) for g in rng.uniform(-0.25, 0.25, 2))
     light = (1 - gx / 2 - gy / 2) + gx / np.float32(c) * x + gy / np.float32(r) * y
     fine = np.where(dark, np.float32(35), np.float32(200)) * light
+    pin, number = _pins(rig.board, x, y)
+    fine = np.where(pin, rng.uniform(50, 220, len(rig.board)).astype(np.float32)[number], fine)
     _paste(image, here, fine, _on_board(rig, x, y), look.color_blur_px)
     noisy = image + rng.standard_normal(image.shape, np.float32) * np.float32(look.color_noise)
     return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
@@ -153,12 +157,12 @@ def thermal_picture(
     rng, board, camera = np.random.default_rng(seed), rig.board, rig.thermal
     image = _blotches(rng, camera, 0, 10)
     here, x, y = _board_xy(rig, "thermal", T_depth_board)
-    i, j = (np.clip(np.round(a), 0, n - 1).astype(int) for a, n in ((x, board.columns), (y, board.rows)))
     across = np.sin(np.linspace(0, np.pi, board.columns) + rng.uniform(0, 3))
     contrast = rng.uniform(100, 360, len(board)) * np.sign(np.tile(across, board.rows) + rng.normal(0, 0.3, len(board)))
     contrast[rng.random(len(board)) < look.missing] = 0
-    pin = np.where((x - i) ** 2 + (y - j) ** 2 < PIN_RADIUS**2, contrast[j * board.columns + i], 0).astype(np.float32)
-    _paste(image, here, pin + np.float32(look.board_warmer), _on_board(rig, x, y), look.thermal_blur_px)
+    pin, number = _pins(board, x, y)
+    spots = np.where(pin, contrast[number], 0).astype(np.float32)
+    _paste(image, here, spots + np.float32(look.board_warmer), _on_board(rig, x, y), look.thermal_blur_px)
     noise = rng.standard_normal(image.shape, np.float32) * np.float32(look.thermal_noise)
     return np.round(24_200 + image + pattern + noise).astype(np.uint16)
 
@@ -238,6 +242,12 @@ def _board_xy(rig: SimulatedRig, name: str, T_depth_board: Float) -> tuple[tuple
     size = ((hi - lo) * FINE).tolist()  # smooth: linear between pixels is true to 1e-3 px
     fine_x, fine_y = (cv2.resize(a.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) for a in (x, y))
     return (slice(lo[1], hi[1]), slice(lo[0], hi[0])), fine_x, fine_y
+
+
+def _pins(board: Board, x: NDArray, y: NDArray) -> tuple[NDArray[np.bool_], NDArray]:
+    """Where a pin's head is, and the number of the nearest pin."""
+    i, j = (np.clip(np.round(a), 0, n - 1).astype(int) for a, n in ((x, board.columns), (y, board.rows)))
+    return (x - i) ** 2 + (y - j) ** 2 < PIN_RADIUS**2, j * board.columns + i
 
 
 def _even(x: NDArray, y: NDArray) -> NDArray[np.bool_]:

@@ -54,8 +54,8 @@ class Noise:
 
 
 def board_poses(rig: SimulatedRig, count: int, rng: np.random.Generator) -> list[Float]:
-    """T_depth_board of stands as docs/calibration.md asks for: tilted by 20 to 45 deg to the left, right, up and down in
-    turn, all over the pictures, at 0.9 to 1.8 m; the whole board in every picture."""
+    """T_depth_board of stands as docs/calibration.md asks for: tilted by 20 to 45 deg to the left, right, up and down
+    in turn, all over the pictures, at 0.9 to 1.8 m; the whole board in every picture."""
     w, h = rig.board.extent_m
     center = pose(np.eye(3), np.array([-w / 2, -h / 2, 0]))
     poses: list[Float] = []
