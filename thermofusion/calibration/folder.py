@@ -32,6 +32,7 @@ from .board import Board
 from .thermal_source import RawLayout
 
 FILE = "calibration.json"
+NO_DISPARITY = 2047  # a Kinect's eleven bits of 1
 SUFFIXES = ("png", "jpg", "tiff", "tif", "pgm", "raw")
 
 
@@ -118,11 +119,14 @@ class CalibrationFolder:
         return self._turned(image if image.ndim == 2 else image[..., 0], "thermal")
 
     def depth(self, name: str) -> NDArray[np.float32]:
-        """(H, W) metres, NaN none; raw disparity as float for `disparity`."""
+        """(H, W) metres, NaN none; for `disparity` counts as float, NaN where `invalid` or eleven bits of 1."""
         path, d = self.files["depth"][name], self._config.depth
         raw = read_image(path, kind="depth")
         if d.kind == "disparity":
-            return self._turned(raw.astype(np.float32), "depth")
+            if raw.dtype != np.uint16 or raw.ndim != 2:
+                raise ScanError(f"disparity is {raw.dtype} with {raw.ndim} axes, expected 16-bit grey", place=path)
+            none = np.isin(raw, [0, *d.invalid]) | (raw >= NO_DISPARITY)
+            return self._turned(np.where(none, np.float32(np.nan), raw.astype(np.float32)), "depth")
         return self._turned(depth_from_raw(raw, d.unit_m, place=path, invalid=tuple(d.invalid)), "depth")
 
     def _turned(self, image: NDArray, camera: str) -> NDArray:
