@@ -141,9 +141,17 @@ def test_netd_drift_and_the_allan_plot(tmp_path, capsys):
     assert found["even_frames"] == found["frames"] == 120
     assert len(found["tau_s"]) == len(found["allan_K"])
     assert "averaging time, s" in plot.read_text()
+    assert found["moving_share"] == 0
     code, _, err = call(capsys, "thermal", "noise", tmp_path / "still")
     assert code == 3
     assert "--rate" in err
+
+
+def test_a_scene_that_was_not_still_is_told(tmp_path, capsys):
+    write_scan(waved(0.0), tmp_path / "scan")
+    code, _, err = call(capsys, "thermal", "noise", tmp_path / "scan")
+    assert code == 0
+    assert "was the scene still?" in err
 
 
 def test_the_point_spread_needs_no_curve(tmp_path, capsys):

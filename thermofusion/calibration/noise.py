@@ -16,6 +16,8 @@ from ..types import Float
 MIN_STILL_FRAMES = 8
 MIN_EDGE_ROWS = 12
 MIN_SLANT_PX = 1.0  # across all rows: an edge along the pixels is sampled at one phase only
+BLOCK_PX = 8
+MOVING_FACTOR = 4.0  # rows and columns of real sensors share some noise: a block is not quieter by its side exactly
 NETD_PIXELS = 20_000  # of a frame, evenly spread: more say nothing new and fill the memory
 
 
@@ -25,7 +27,8 @@ class StillNoise:
 
     tau_s, allan_K : averaging times and Allan deviation of the image mean, over the longest stretch without a gap.
     drift_K_per_min : slope of the mean. best_tau_s : averaging beyond this no longer helps, drift takes over.
-    frames, duration_s : of the recording. even_frames : in that stretch.
+    frames, duration_s : of the recording. even_frames : in that stretch. moving_share : of the picture, where blocks
+    of pixels change from frame to frame by far more than independent pixels would: the scene was not still there.
     """
 
     netd_K: float
@@ -36,6 +39,7 @@ class StillNoise:
     frames: int
     duration_s: float
     even_frames: int
+    moving_share: float
 
 
 def still_noise(frames_degC: Iterable[NDArray], times_s: NDArray) -> StillNoise:
@@ -43,11 +47,13 @@ def still_noise(frames_degC: Iterable[NDArray], times_s: NDArray) -> StillNoise:
 
     Raises ScanError with fewer than 8 frames, or times that are not finite and rising.
     """
-    means, some = [], []
+    means, some, coarse, side = [], [], [], 1
     for frame in frames_degC:
         x = np.asarray(frame, np.float64)
         means.append(np.nanmean(x))
         some.append(x.ravel()[:: x.size // NETD_PIXELS + 1])
+        side = max(1, min(BLOCK_PX, *(n // 4 for n in x.shape)))
+        coarse.append(_blocks(x, side))
     mean, t = np.array(means), np.asarray(times_s, np.float64)
     if len(mean) < MIN_STILL_FRAMES:
         raise ScanError(f"{len(mean)} frames are too few for noise and drift", hint="record a still scene for a minute")
@@ -56,11 +62,19 @@ def still_noise(frames_degC: Iterable[NDArray], times_s: NDArray) -> StillNoise:
     d = np.diff(np.array(some) - mean[:, None], axis=0)  # differences: slow pixel drift falls out
     measured = ~np.isnan(d).all(axis=0)
     netd = float(np.median(1.4826 * np.nanmedian(np.abs(d[:, measured]), axis=0))) / np.sqrt(2)
+    change = np.sqrt(np.mean(np.diff(np.array(coarse) - mean[:, None], axis=0) ** 2, axis=0)) / np.sqrt(2)
+    moving = float(np.mean(change > MOVING_FACTOR * netd / side))
     even = _longest_even(t)
     tau, allan = allan_deviation(mean[even], float(np.median(np.diff(t))))
     slope = float(np.polyfit((t - t.mean()) / 60, mean, 1)[0])
     best = float(tau[np.argmin(allan)])
-    return StillNoise(netd, slope, tau, allan, best, len(t), float(t[-1] - t[0]), even.stop - even.start)
+    return StillNoise(netd, slope, tau, allan, best, len(t), float(t[-1] - t[0]), even.stop - even.start, moving)
+
+
+def _blocks(x: Float, side: int) -> Float:
+    """Means of blocks of side x side px, (N,)."""
+    h, w = (n // side for n in x.shape)
+    return x[: h * side, : w * side].reshape(h, side, w, side).mean(axis=(1, 3)).ravel()
 
 
 def _longest_even(t: Float) -> slice:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..errors import RecipeError, ScanError
-from .console import Progress, emit, progress
+from .console import Progress, emit, note, progress
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,6 +28,7 @@ Raw = Annotated[
 ]
 
 FIELD_MARGIN = 0.1  # of the curve's range: vignetting and noise about a source at its end
+STILL_SHARE = 0.02  # of a picture may move in a still recording
 
 verbs = typer.Typer(
     help="The thermal camera by itself: curve, field, flatten, noise, edge, time-offset.", no_args_is_help=True
@@ -172,6 +173,8 @@ def noise(
         f"averaging helps up to {found.best_tau_s:.3g} s; {found.frames} frames in {found.duration_s:.1f} s"
     )
     emit(found, text if out is None else f"{text}\nwrote {out}", json)
+    if found.moving_share > STILL_SHARE:
+        note(f"{found.moving_share:.0%} of the picture changes by far more than noise does: was the scene still?")
 
 
 @verbs.command()
