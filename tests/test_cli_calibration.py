@@ -139,7 +139,9 @@ def test_netd_drift_and_the_allan_plot(tmp_path, capsys):
     assert abs(found["netd_K"] / 0.05 - 1) < 0.03
     assert abs(found["drift_K_per_min"] - 0.6) < 0.02
     assert found["even_frames"] == found["frames"] == 120
-    assert len(found["tau_s"]) == len(found["allan_K"])
+    tau, allan = np.array(found["tau_s"]), np.array(found["allan_K"])
+    white, ramp = 0.05 / np.sqrt(tau / 0.1), 0.01 * tau / np.sqrt(2)
+    np.testing.assert_allclose(allan, np.hypot(white, ramp), rtol=0.05)
     assert "averaging time, s" in plot.read_text()
     assert found["moving_share"] == 0
     code, _, err = call(capsys, "thermal", "noise", tmp_path / "still")

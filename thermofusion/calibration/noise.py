@@ -17,6 +17,7 @@ MIN_STILL_FRAMES = 8
 MIN_EDGE_ROWS = 12
 MIN_SLANT_PX = 1.0  # across all rows: an edge along the pixels is sampled at one phase only
 BLOCK_PX = 8
+ALLAN_PIXELS = 2000
 MOVING_FACTOR = 4.0  # rows and columns of real sensors share some noise: a block is not quieter by its side exactly
 NETD_PIXELS = 20_000  # of a frame, evenly spread: more say nothing new and fill the memory
 
@@ -25,8 +26,9 @@ NETD_PIXELS = 20_000  # of a frame, evenly spread: more say nothing new and fill
 class StillNoise:
     """netd_K : temporal noise of a pixel (median over pixels, the frame's common drift taken off).
 
-    tau_s, allan_K : averaging times and Allan deviation of the image mean, over the longest stretch without a gap.
-    drift_K_per_min : slope of the mean. best_tau_s : averaging beyond this no longer helps, drift takes over.
+    tau_s : averaging times; allan_K, allan_mean_K : Allan deviation of a pixel (rms over pixels) and of the image mean,
+    over the longest stretch without a gap. best_tau_s : averaging a pixel for longer no longer helps, drift takes over.
+    drift_K_per_min : slope of the image mean.
     frames, duration_s : of the recording. even_frames : in that stretch. moving_share : of the picture, where blocks
     of pixels change from frame to frame by far more than independent pixels would: the scene was not still there.
     """
@@ -35,6 +37,7 @@ class StillNoise:
     drift_K_per_min: float
     tau_s: Float
     allan_K: Float
+    allan_mean_K: Float
     best_tau_s: float
     frames: int
     duration_s: float
@@ -65,10 +68,15 @@ def still_noise(frames_degC: Iterable[NDArray], times_s: NDArray) -> StillNoise:
     change = np.sqrt(np.mean(np.diff(np.array(coarse) - mean[:, None], axis=0) ** 2, axis=0)) / np.sqrt(2)
     moving = float(np.mean(change > MOVING_FACTOR * netd / side))
     even = _longest_even(t)
-    tau, allan = allan_deviation(mean[even], float(np.median(np.diff(t))))
+    step = float(np.median(np.diff(t)))
+    pixels = np.array(some)[even][:, measured]
+    tau, allan = allan_deviation(pixels[:, :: pixels.shape[1] // ALLAN_PIXELS + 1], step)
+    common = allan_deviation(mean[even], step)[1]
     slope = float(np.polyfit((t - t.mean()) / 60, mean, 1)[0])
     best = float(tau[np.argmin(allan)])
-    return StillNoise(netd, slope, tau, allan, best, len(t), float(t[-1] - t[0]), even.stop - even.start, moving)
+    return StillNoise(
+        netd, slope, tau, allan, common, best, len(t), float(t[-1] - t[0]), even.stop - even.start, moving
+    )
 
 
 def _blocks(x: Float, side: int) -> Float:
@@ -87,17 +95,19 @@ def _longest_even(t: Float) -> slice:
 
 
 def allan_deviation(x: NDArray, step_s: float) -> tuple[Float, Float]:
-    """Overlapping Allan deviation of an evenly sampled series: averaging times (M,) s and deviation (M,), unit of x.
+    """Overlapping Allan deviation of an evenly sampled series (N,), or rms of that of several (N, K): averaging times
+    (M,) s and deviation (M,), unit of x.
 
     σ²(τ) = ½ <(mean of the next m samples - mean of these m)²> (NIST SP 1065, Eq. 9).
     """
-    total = np.concatenate([[0.0], np.cumsum(np.asarray(x, np.float64))])
+    x = np.asarray(x, np.float64)
+    total = np.concatenate([np.zeros((1, *x.shape[1:])), np.cumsum(x - x.mean(axis=0), axis=0)])
     sizes = np.unique(np.geomspace(1, max(len(x) // 3, 1), 24).astype(int))
     out = []
     for m in sizes:
         average = (total[m:] - total[:-m]) / m
         d = average[m:] - average[:-m]
-        out.append(np.sqrt(0.5 * np.mean(d**2)))
+        out.append(np.sqrt(0.5 * np.nanmean(d**2)))
     return sizes * step_s, np.array(out)
 
 

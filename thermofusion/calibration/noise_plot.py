@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..paper.figure import BLUE, DASHED, GREY, Axis, Line, Mark, Plot, Points, page
+from ..paper.figure import BLUE, DASHED, GREY, ORANGE, Axis, Line, Mark, Plot, Points, page
 from ..types import Float
 from .noise import StillNoise
 
@@ -27,24 +27,27 @@ class LogAxis(Axis):
 
 
 def allan_svg(noise: StillNoise) -> str:
-    """Allan deviation of the image mean [mK] over the averaging time [s], as an SVG document."""
-    good = noise.allan_K > 0
-    x, y = np.log10(noise.tau_s[good]), np.log10(noise.allan_K[good] * 1e3)
+    """Allan deviation of a pixel and of the image mean [mK] over the averaging time [s], as an SVG document."""
+    good = (noise.allan_K > 0) & (noise.allan_mean_K > 0)
+    x, y, common = np.log10(noise.tau_s[good]), *(np.log10(a[good] * 1e3) for a in (noise.allan_K, noise.allan_mean_K))
     white = y[0] - 0.5 * (x - x[0])  # independent frames: down with the root of the time
     marks: list[Mark] = [
         Line(x, white, GREY, "independent frames", DASHED, 1.5),
         Line(x, y, BLUE),
-        Points(x, y, BLUE, "measured"),
+        Points(x, y, BLUE, "a pixel"),
+        Line(x, common, ORANGE),
+        Points(x, common, ORANGE, "image mean"),
     ]
-    lo, hi = _span(np.concatenate([y, white]))
+    lo, hi = _span(np.concatenate([y, white, common]))
     plot = Plot(
-        "Allan deviation of the image mean",
+        "Allan deviation",
         LogAxis("averaging time, s", *_span(x), 1.0),
         LogAxis("deviation, mK", lo, hi, 1.0),
         marks,
+        legend="sw",
     )
     caption = (
-        f"NETD {noise.netd_K * 1e3:.1f} mK, drift {noise.drift_K_per_min:+.3f} K/min; averaging helps up to "
+        f"NETD {noise.netd_K * 1e3:.1f} mK, drift {noise.drift_K_per_min:+.3f} K/min; averaging a pixel helps up to "
         f"{noise.best_tau_s:.3g} s; {noise.frames} frames in {noise.duration_s:.1f} s"
     )
     return page([plot], caption=caption, columns=1, panel_px=(640.0, 420.0))

@@ -170,7 +170,7 @@ def noise(
     text = (
         f"NETD      {found.netd_K * 1e3:.1f} mK (netd_K in scan.json)\n"
         f"drift     {found.drift_K_per_min:+.3f} K/min of the image mean\n"
-        f"averaging helps up to {found.best_tau_s:.3g} s; {found.frames} frames in {found.duration_s:.1f} s"
+        f"averaging a pixel helps up to {found.best_tau_s:.3g} s; {found.frames} frames in {found.duration_s:.1f} s"
     )
     emit(found, text if out is None else f"{text}\nwrote {out}", json)
     if found.moving_share > STILL_SHARE:
