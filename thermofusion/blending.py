@@ -32,7 +32,8 @@ from .uncertainty import (
     vertex_uncertainty,
 )
 
-BLOCK = 1_500_000  # rows worked on at once by each of two threads: bounds memory whatever the scan
+THREADS = 2
+BLOCK = 1_500_000  # rows worked on at once by each thread: bounds memory whatever the scan
 MODES = 10  # of the calibration's covariance that are followed to each vertex
 FACING_DEG = 15.0  # what counts as straight on for the paper's S
 
@@ -135,8 +136,9 @@ def blend(
             replace(rows, vertex=groups.rows(np.arange(len(groups), dtype=np.int32))), groups, L_r, task, local
         )
 
-    edges = np.linspace(0, n_vertices, max(1, -(-len(observations) // BLOCK)) + 1).astype(int).tolist()
-    with ThreadPoolExecutor(max_workers=2) as pool:
+    rounds = max(1, -(-len(observations) // (THREADS * BLOCK)))  # whole rounds: no thread waits for the other
+    edges = np.linspace(0, n_vertices, THREADS * rounds + 1).astype(int).tolist()
+    with ThreadPoolExecutor(max_workers=THREADS) as pool:
         return _assembled(list(pool.map(block, pairwise(edges))), oblique, n_vertices, task)
 
 

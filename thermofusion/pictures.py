@@ -7,6 +7,7 @@ every colour inside the outline is one of the bar's; unmeasured skin is hatched;
 from __future__ import annotations
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -104,7 +105,9 @@ def write_views(
 ) -> list[Path]:
     """Write `front.png` … `overview.png` into a folder, made if need be. Raises as `render_views`, ResourceError."""
     pictures = render_views(mesh, palette=palette, range_degC=range_degC, height_px=height_px)
-    return [write_png(Path(folder) / f"{name}.png", picture) for name, picture in pictures.items()]
+    paths = [Path(folder) / f"{name}.png" for name in pictures]
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        return list(pool.map(write_png, paths, pictures.values()))
 
 
 def write_png(path: str | Path, image: UInt8) -> Path:
@@ -139,10 +142,13 @@ def draw(casts: list[Cast], values: NDArray, scale: Scale, *, height_px: int) ->
     beyond = bool((finite < scale.lo).any()), bool((finite > scale.hi).any())
     legend = ["unmeasured"] if len(finite) < len(values) else []
     legend += ["inside"] if any((cast.facing < 0).any() for cast in casts) else []
-    panels = {cast.name: paint(cast, values, scale) for cast in casts}
     page, px_per_m = _Page(height_px), casts[0].px_per_m
-    pages = {name: page.compose({name: panel}, scale, beyond, legend, px_per_m) for name, panel in panels.items()}
-    return pages | {"overview": page.compose(panels, scale, beyond, legend, px_per_m)}
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        painted = pool.map(lambda cast: paint(cast, values, scale), casts)
+        panels = {cast.name: panel for cast, panel in zip(casts, painted, strict=True)}
+        sheets = {name: {name: panel} for name, panel in panels.items()} | {"overview": panels}
+        composed = pool.map(lambda sheet: page.compose(sheet, scale, beyond, legend, px_per_m), sheets.values())
+        return dict(zip(sheets, composed, strict=True))
 
 
 def paint(cast: Cast, values: NDArray, scale: Scale) -> UInt8:

@@ -5,6 +5,7 @@ A view is cast once and drawn as often as there are maps to show. Four rays per 
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,7 +90,8 @@ def cast_views(
     scene = o3d.t.geometry.RaycastingScene()
     centred = (local - (lo + hi) / 2).astype(np.float32)
     scene.add_triangles(o3d.core.Tensor(centred), o3d.core.Tensor(surface.triangles.astype(np.uint32)))
-    return [_cast(scene, surface.triangles, name, half, scale, height_px) for name in views]
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        return list(pool.map(lambda name: _cast(scene, surface.triangles, name, half, scale, height_px), views))
 
 
 def _cast(scene: object, triangles: Int, name: str, half: Float, scale: float, h: int) -> Cast:
