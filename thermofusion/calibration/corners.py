@@ -20,7 +20,7 @@ ITERATIONS = 12
 MAX_MOVE_PX = 1.5  # a crossing that runs farther from its detection has met something else
 
 
-def refine_corners(grey: NDArray[np.uint8], grid: Float) -> Float:
+def refine_corners(grey: NDArray, grid: Float) -> Float:
     """Grid (rows, columns, 2) px of detected crossings, each moved to the best fit; where that fails, as it was.
 
     Brightness about a crossing: a plane, plus a plane times E1·E2, with E = erf(d / (sqrt(2) sigma)) of the distance d
@@ -83,8 +83,7 @@ def _step(shape: Float, values: Float, du: NDArray, dv: NDArray) -> tuple[Float,
     J = np.concatenate([np.stack(columns, axis=2), linear], axis=2)
     Jt = np.transpose(J, (0, 2, 1))
     H = Jt @ J
-    k = np.arange(H.shape[1])
-    H[:, k, k] *= 1 + 1e-6
-    H[:, k, k] += 1e-9
+    diagonal = np.arange(H.shape[1])
+    H[:, diagonal, diagonal] = H[:, diagonal, diagonal] * (1 + 1e-6) + 1e-9
     step = np.linalg.solve(H, Jt @ misfit[..., None])[:, :5, 0]
     return step, np.mean(misfit**2, axis=1)

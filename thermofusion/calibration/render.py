@@ -1,7 +1,8 @@
 """Pictures of a simulated rig: a calibration folder with known truth, to go through the real readers and detectors.
 
-Every picture is evaluated where the camera's true, distorted rays meet the board, on a grid finer than the pixels,
-blurred by the lens, averaged over the pixel, and made noisy. Nothing in it knows how detectors work.
+Every picture is evaluated where the camera's true, distorted rays meet the board, on a grid finer than the pixels with
+edges covered in part, blurred by the lens, averaged over the pixel, and made noisy. Nothing in it knows how detectors
+work.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from ..types import Camera, Float
 from .board import Board
 from .simulate import SimulatedRig, board_poses, true_pixels
 
-FINE = 4  # samples per pixel and axis
+FINE = 2  # samples per pixel and axis
 RIM = 0.7  # of the board beyond its points, spacings
 WALL_M = 3.0
 PIN_RADIUS = 0.05  # spacings
@@ -54,6 +55,7 @@ class Kinect:
     ragged_px, grown_px : one sigma of an edge's wandering, and how far foreground spreads over background. bend_m :
     bowl of the depth over the image, m at 1 m. scale, offset_m : of reported against true depth. lost, dark_lost :
     share of pixels without depth, and of those on dark squares. projector_m : base; what it cannot reach is lost.
+    sheet_focal : focal length of the data sheet over the true one.
     """
 
     step_m: float = 2.85e-3
@@ -68,6 +70,13 @@ class Kinect:
     lost: float = 0.03
     dark_lost: float = 0.0
     projector_m: float = 0.075
+    sheet_focal: float = 0.99
+
+    @staticmethod
+    def drawn(seed: int) -> Kinect:
+        """One of many cameras: its own bowl, scale and offset, and another error of the data sheet."""
+        bend, scale, offset, sheet = np.random.default_rng([seed, 1]).standard_normal(4)
+        return Kinect(bend_m=1e-3 * bend, scale=3e-3 * scale, offset_m=1.5e-3 * offset, sheet_focal=1 + 0.007 * sheet)
 
 
 def write_folder(
@@ -83,8 +92,8 @@ def write_folder(
 ) -> list[Float]:
     """A calibration folder of a simulated afternoon; returns the true T_depth_board of its views.
 
-    lens_known : calibration.json gives the true depth lens as the maker's calibration; otherwise a data sheet's, 1 %
-    off in focal length. board_margin_m : stated there too.
+    lens_known : calibration.json gives the true depth lens as the maker's calibration; otherwise a data sheet's,
+    centred. board_margin_m : stated there too.
     """
     pictures, kinect = pictures or Pictures(), kinect or Kinect()
     rng = np.random.default_rng(seed)
@@ -98,19 +107,21 @@ def write_folder(
         _write(root / f"thermal/{i:04d}.png", thermal_picture(rig, T, s[1], pictures, pattern))
         depth_mm = np.round(1e3 * depth_picture(rig, T, s[2], kinect))
         _write(root / f"depth/{i:04d}.png", np.nan_to_num(depth_mm).astype(np.uint16))
-    (root / "calibration.json").write_text(json.dumps(_config(rig, lens_known, board_margin_m)))
+    (root / "calibration.json").write_text(
+        json.dumps(_config(rig, None if lens_known else kinect.sheet_focal, board_margin_m))
+    )
     return poses
 
 
-def _config(rig: SimulatedRig, lens_known: bool, board_margin_m: float | None) -> dict[str, Any]:
+def _config(rig: SimulatedRig, sheet_focal: float | None, board_margin_m: float | None) -> dict[str, Any]:
     board, lens = rig.board, rig.depth
-    w, h, f = lens.width_px, lens.height_px, 0.99 * lens.K[0, 0]
-    K = lens.K if lens_known else np.array([[f, 0, (w - 1) / 2], [0, f, (h - 1) / 2], [0, 0, 1]])
+    w, h, f = lens.width_px, lens.height_px, (sheet_focal or 1) * lens.K[0, 0]
+    K = lens.K if sheet_focal is None else np.array([[f, 0, (w - 1) / 2], [0, f, (h - 1) / 2], [0, 0, 1]])
     about = {"kind": board.kind, "columns": board.columns, "rows": board.rows, "spacing_m": board.spacing_m}
     if board_margin_m is not None:
         about["margin_m"] = board_margin_m
     camera = {"width_px": w, "height_px": h, "K": K.tolist()}
-    return {"board": about, "depth": {"unit_m": 0.001, "lens_known": lens_known, "camera": camera}}
+    return {"board": about, "depth": {"unit_m": 0.001, "lens_known": sheet_focal is None, "camera": camera}}
 
 
 def _write(path: Path, image: NDArray) -> None:
@@ -124,16 +135,16 @@ def color_picture(rig: SimulatedRig, T_depth_board: Float, seed: int, look: Pict
     """(H, W) grey levels: squares and white rim under uneven light before a blotchy wall; lens blur, noise, 8 bit."""
     rng, camera = np.random.default_rng(seed), rig.color
     image = _blotches(rng, camera, 90, 25)
-    here, x, y = _board_xy(rig, "color", T_depth_board)
-    c, r = rig.board.columns - 1, rig.board.rows - 1
-    squares = (x > 0) & (x < c) & (y > 0) & (y < r)
-    dark = squares & _even(x, y)
+    here, at = _board_xy(rig, "color", T_depth_board)
+    x, y, c, r = at.x, at.y, rig.board.columns - 1, rig.board.rows - 1
+    dark = _squares(at) * at.inside(c, r, 0.0)
     gx, gy = (np.float32(g) for g in rng.uniform(-0.25, 0.25, 2))
     light = (1 - gx / 2 - gy / 2) + gx / np.float32(c) * x + gy / np.float32(r) * y
-    fine = np.where(dark, np.float32(35), np.float32(200)) * light
-    pin, number = _pins(rig.board, x, y)
-    fine = np.where(pin, rng.uniform(50, 220, len(rig.board)).astype(np.float32)[number], fine)
-    _paste(image, here, fine, _on_board(rig, x, y), look.color_blur_px)
+    pin, number = _pins(rig.board, at)
+    heads = rng.uniform(50, 220, len(rig.board)).astype(np.float32)[number]
+    fine = (np.float32(200) - np.float32(165) * dark) * light
+    fine.ravel()[pin[0]] += pin[1] * (heads - fine.ravel()[pin[0]])
+    _paste(image, here, fine, at.inside(c, r, RIM), look.color_blur_px)
     noisy = image + rng.standard_normal(image.shape, np.float32) * np.float32(look.color_noise)
     return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
 
@@ -156,13 +167,14 @@ def thermal_picture(
     """
     rng, board, camera = np.random.default_rng(seed), rig.board, rig.thermal
     image = _blotches(rng, camera, 0, 10)
-    here, x, y = _board_xy(rig, "thermal", T_depth_board)
+    here, at = _board_xy(rig, "thermal", T_depth_board)
     across = np.sin(np.linspace(0, np.pi, board.columns) + rng.uniform(0, 3))
     contrast = rng.uniform(100, 360, len(board)) * np.sign(np.tile(across, board.rows) + rng.normal(0, 0.3, len(board)))
     contrast[rng.random(len(board)) < look.missing] = 0
-    pin, number = _pins(board, x, y)
-    spots = np.where(pin, contrast[number], 0).astype(np.float32)
-    _paste(image, here, spots + np.float32(look.board_warmer), _on_board(rig, x, y), look.thermal_blur_px)
+    pin, number = _pins(board, at)
+    fine = np.full(at.x.shape, look.board_warmer, np.float32)
+    fine.ravel()[pin[0]] += pin[1] * contrast[number].astype(np.float32)
+    _paste(image, here, fine, at.inside(board.columns - 1, board.rows - 1, RIM), look.thermal_blur_px)
     noise = rng.standard_normal(image.shape, np.float32) * np.float32(look.thermal_noise)
     return np.round(24_200 + image + pattern + noise).astype(np.uint16)
 
@@ -184,7 +196,7 @@ def depth_picture(rig: SimulatedRig, T_depth_board: Float, seed: int, kinect: Ki
     lost = rng.random(z.shape, np.float32) < k.lost
     lost |= ~on & _in_shadow(rig, T_depth_board, u, v, k.projector_m)
     squares = (x > 0) & (x < rig.board.columns - 1) & (y > 0) & (y < rig.board.rows - 1)
-    dark = squares & _even(x, y)
+    dark = squares & ((np.floor(x) + np.floor(y)) % 2 == 0)
     lost |= on & dark & (rng.random(z.shape, np.float32) < k.dark_lost)
     r2 = ((u - camera.K[0, 2]) ** 2 + (v - camera.K[1, 2]) ** 2) / camera.K[0, 0] ** 2
     reported = z + k.scale * z + k.offset_m + k.bend_m * (8 * r2 - 1) * z**2
@@ -230,29 +242,54 @@ def _plane_xy(H: Float, x: NDArray, y: NDArray) -> tuple[NDArray, NDArray, NDArr
     return a / w, b / w, w
 
 
-def _board_xy(rig: SimulatedRig, name: str, T_depth_board: Float) -> tuple[tuple[slice, slice], NDArray, NDArray]:
-    """The part of a picture that holds the board, and the board's coordinates [spacings] at its fine samples."""
+@dataclass(frozen=True, eq=False)
+class _OnBoard:
+    """Where fine samples lie on the board: x, y and the width of a sample along either, all in spacings."""
+
+    x: NDArray[np.float32]
+    y: NDArray[np.float32]
+    dx: NDArray[np.float32]
+    dy: NDArray[np.float32]
+
+    def inside(self, columns: int, rows: int, rim: float) -> NDArray[np.float32]:
+        """Share of each sample within the rectangle from (-rim, -rim) to (columns + rim, rows + rim)."""
+        share = [
+            np.clip((n / 2 + rim - np.abs(a - n / 2)) / d + 0.5, 0, 1)
+            for a, d, n in ((self.x, self.dx, np.float32(columns)), (self.y, self.dy, np.float32(rows)))
+        ]
+        return (share[0] * share[1]).astype(np.float32)
+
+
+def _board_xy(rig: SimulatedRig, name: str, T_depth_board: Float) -> tuple[tuple[slice, slice], _OnBoard]:
+    """The part of a picture that holds the board, and where its fine samples lie."""
     camera = rig.camera(name)
     px = true_pixels(rig, name, T_depth_board)
     margin = (RIM + 0.3) * np.linalg.norm(np.ptp(px, axis=0)) / (min(rig.board.columns, rig.board.rows) - 1) + 4
     lo = np.maximum(np.floor(px.min(0) - margin), 0).astype(int)
     hi = np.minimum(np.ceil(px.max(0) + margin) + 1, [camera.width_px, camera.height_px]).astype(int)
-    v, u = np.mgrid[lo[1] : hi[1], lo[0] : hi[0]].astype(np.float64)
+    hi -= (hi - lo) % 2
+    v, u = np.mgrid[lo[1] : hi[1] : 2, lo[0] : hi[0] : 2] + 0.5  # between them: linear to 1e-3 px
     x, y, _ = _plane_xy(_homography(rig, name, T_depth_board), *_rays(camera, u, v))
-    size = ((hi - lo) * FINE).tolist()  # smooth: linear between pixels is true to 1e-3 px
-    fine_x, fine_y = (cv2.resize(a.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) for a in (x, y))
-    return (slice(lo[1], hi[1]), slice(lo[0], hi[0])), fine_x, fine_y
+    steps = [np.hypot(*np.gradient(a)) / (2 * FINE) for a in (x, y)]
+    size = ((hi - lo) * FINE).tolist()
+    fine = [cv2.resize(a.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) for a in (x, y, *steps)]
+    return (slice(lo[1], hi[1]), slice(lo[0], hi[0])), _OnBoard(*(np.asarray(a, np.float32) for a in fine))
 
 
-def _pins(board: Board, x: NDArray, y: NDArray) -> tuple[NDArray[np.bool_], NDArray]:
-    """Where a pin's head is, and the number of the nearest pin."""
-    i, j = (np.clip(np.round(a), 0, n - 1).astype(int) for a, n in ((x, board.columns), (y, board.rows)))
-    return (x - i) ** 2 + (y - j) ** 2 < PIN_RADIUS**2, j * board.columns + i
+def _squares(at: _OnBoard) -> NDArray[np.float32]:
+    """Share of each sample that is on squares of even parity."""
+    i, j = np.rint(at.x), np.rint(at.y)
+    sign = 1 - 2 * ((i.astype(np.int16) + j.astype(np.int16)) & 1).astype(np.float32)
+    return 0.5 + 2 * sign * np.clip((at.x - i) / at.dx, -0.5, 0.5) * np.clip((at.y - j) / at.dy, -0.5, 0.5)
 
 
-def _even(x: NDArray, y: NDArray) -> NDArray[np.bool_]:
-    """True on squares of even parity."""
-    return (np.floor(x).astype(np.int16) + np.floor(y).astype(np.int16)) & 1 == 0
+def _pins(board: Board, at: _OnBoard) -> tuple[tuple[NDArray, NDArray[np.float32]], NDArray]:
+    """Samples (flat index) on a pin's head with the share covered, and the number of each one's pin."""
+    i, j = np.rint(at.x), np.rint(at.y)
+    share = (PIN_RADIUS - np.hypot(at.x - i, at.y - j)) / (0.5 * (at.dx + at.dy)) + 0.5
+    k = np.flatnonzero((share > 0) & (i >= 0) & (i < board.columns) & (j >= 0) & (j < board.rows))
+    number = j.ravel()[k] * board.columns + i.ravel()[k]
+    return (k, np.minimum(share.ravel()[k], 1)), number.astype(int)
 
 
 def _on_board(rig: SimulatedRig, x: NDArray, y: NDArray, rim: float = RIM) -> NDArray[np.bool_]:
@@ -261,12 +298,12 @@ def _on_board(rig: SimulatedRig, x: NDArray, y: NDArray, rim: float = RIM) -> ND
 
 
 def _paste(
-    image: NDArray[np.float32], here: tuple[slice, slice], fine: NDArray, on: NDArray[np.bool_], blur_px: float
+    image: NDArray[np.float32], here: tuple[slice, slice], fine: NDArray, share: NDArray[np.float32], blur_px: float
 ) -> None:
     """The board's fine samples into the picture: blurred, averaged over pixels, over what is behind at its edge."""
     h, w = image[here].shape
     behind = cv2.resize(image[here], (w * FINE, h * FINE), interpolation=cv2.INTER_LINEAR)
-    whole = np.where(on, fine, behind).astype(np.float32)
+    whole = (behind + share * (fine - behind)).astype(np.float32)
     blurred = cv2.GaussianBlur(whole, (0, 0), blur_px * FINE)
     image[here] = cv2.resize(blurred, (w, h), interpolation=cv2.INTER_AREA)
 
