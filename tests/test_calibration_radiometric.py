@@ -69,6 +69,12 @@ def test_a_field_flattens_a_uniform_source():
     frames = np.stack([T + bowl * (1 + 0.02 * (T - 30)) for T in levels])
     field = fit_field(frames, levels)
     assert np.ptp(field.correct(35 + bowl * 1.1)) < 0.05 * np.ptp(bowl)
+    frames[1, 3, 4] = np.nan  # a dead pixel takes no other with it
+    again = fit_field(frames, levels)
+    assert again.z[:, 3, 4].tolist() == [0, 0]
+    np.testing.assert_allclose(
+        np.delete(again.z.reshape(2, -1), 3 * 64 + 4, 1), np.delete(field.z.reshape(2, -1), 196, 1)
+    )
     with pytest.raises(ScanError, match="do not carry"):
         fit_field(frames[:1], levels[:1])
 

@@ -279,6 +279,7 @@ def test_a_rig_without_a_curve_leaves_the_scans_own(tmp_path):
         (["noise", "a.png", "--curve", "three.csv"], 3, ["JSON"]),
         (["noise", "a.png", "-o", "noise.jpeg"], 2, [".svg"]),
         (["noise", "a.tiff", "--rate", "9", "-o", "x.svg"], 3, ["a.tiff", "1 frames are too few"]),
+        (["noise", "mixed", "--rate", "9"], 3, ["b.tiff", "is 40 x 60 px, expected 80 x 60"]),
         (["edge", "grey8.png"], 3, ["uint8", "16-bit"]),
         (["edge", "a.png"], 3, ["a.png", "edge"]),
         (["edge", "a.png", "--box", "1,2,3"], 2, ["LEFT,TOP,WIDTH,HEIGHT"]),
@@ -303,6 +304,9 @@ def test_errors_are_one_sentence(arguments, code, words, tmp_path, monkeypatch, 
     cv2.imwrite("a.tiff", np.full((H, W), 20, np.float32))
     cv2.imwrite("grey8.png", np.zeros((H, W), np.uint8))
     Path("a.raw").write_bytes(b"12")
+    Path("mixed").mkdir()
+    cv2.imwrite("mixed/a.tiff", np.full((H, W), 20, np.float32))
+    cv2.imwrite("mixed/b.tiff", np.full((H, W // 2), 20, np.float32))
     write_field(Path("small.npz"), PixelField(np.zeros((2, 2, 3), np.float32)))
     before = set(tmp_path.iterdir())
     got, out, err = call(capsys, "thermal", *arguments)

@@ -19,7 +19,7 @@ MIN_SLANT_PX = 1.0  # across all rows: an edge along the pixels is sampled at on
 BLOCK_PX = 8
 ALLAN_PIXELS = 2000
 MOVING_FACTOR = 4.0  # rows and columns of real sensors share some noise: a block is not quieter by its side exactly
-NETD_PIXELS = 20_000  # of a frame, evenly spread: more say nothing new and fill the memory
+NETD_PIXELS = 5000  # of a frame, evenly spread: more say nothing new and fill the memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ def still_noise(frames_degC: Iterable[NDArray], times_s: NDArray) -> StillNoise:
     for frame in frames_degC:
         x = np.asarray(frame, np.float64)
         means.append(np.nanmean(x))
-        some.append(x.ravel()[:: x.size // NETD_PIXELS + 1])
+        some.append(x.ravel()[:: x.size // NETD_PIXELS + 1].astype(np.float32))
         side = max(1, min(BLOCK_PX, *(n // 4 for n in x.shape)))
         coarse.append(_blocks(x, side))
     mean, t = np.array(means), np.asarray(times_s, np.float64)

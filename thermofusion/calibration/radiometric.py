@@ -218,6 +218,7 @@ def fit_field(frames_degC: NDArray, degC: NDArray, *, degree: int = 1) -> PixelF
     x = T - T.mean()
     A = np.vander(x / max(np.abs(x).max(), 1e-9), degree + 1, increasing=True)
     excess = (np.asarray(frames_degC, np.float64) - T[:, None, None]).reshape(len(T), -1)
+    excess[:, ~np.isfinite(excess).all(axis=0)] = 0.0  # dead pixels: nothing is known, nothing is taken off
     c, *_ = np.linalg.lstsq(A, excess, rcond=None)
     scale, center = max(np.abs(x).max(), 1e-9), T.mean()
     z = np.zeros_like(c)

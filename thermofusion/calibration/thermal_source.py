@@ -147,12 +147,13 @@ def _open(path: Path, raw: RawLayout | None) -> ThermalSource:
     files = sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES) if path.is_dir() else [path]
     if not files:
         raise ScanError("there are no thermal pictures here", place=path, hint="expected PNG, TIFF, PGM or .raw")
-    return ThermalSource(tuple(map(str, files)), np.full(len(files), np.nan), lambda i: _picture(files[i], raw))
+    shape = _picture(files[0], raw, None).shape[:2]
+    return ThermalSource(tuple(map(str, files)), np.full(len(files), np.nan), lambda i: _picture(files[i], raw, shape))
 
 
-def _picture(path: Path, raw: RawLayout | None) -> NDArray:
+def _picture(path: Path, raw: RawLayout | None, shape: tuple[int, int] | None) -> NDArray:
     if path.suffix.lower() != ".raw":
-        return read_image(path, kind="thermal")
+        return read_image(path, shape=shape, kind="thermal picture")
     if raw is None:
         raise ScanError("a .raw picture needs its size", place=path, hint="give --raw WIDTHxHEIGHT")
     return raw.read(path)
