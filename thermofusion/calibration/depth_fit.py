@@ -24,7 +24,7 @@ from .views import CalibrationSet
 # One sigma of the depth camera's place about the guess, hub axes: pupils on one frame stand side by side, not behind
 # each other; boards alone trade that distance against the depth scale.
 DEPTH_PLACE_M = (0.1, 0.1, 0.015)
-PLANE_FLOOR = 5e-5  # m at 1 m: no depth camera is truer than this over a whole plane, however many pixels it averages
+PLANE_FLOOR = 2.5e-5  # m at 1 m: no depth camera is truer than this over a whole plane, however many pixels it averages
 MIN_MARKED_VIEWS = 4
 KINECT_FOCAL = 585.0 / 640.0  # image widths; structured-light and many time-of-flight cameras lie near it
 

@@ -53,7 +53,8 @@ def _corners(grey: NDArray, size: tuple[int, int]) -> NDArray | None:
             margin = 2.0 * (hi - lo).max() / (min(size) - 1) + factor
             u0, v0 = np.maximum(lo - margin, 0).astype(int)
             u1, v1 = (hi + margin).astype(int) + 1
-            found, corners = cv2.findChessboardCornersSB(np.ascontiguousarray(grey[v0:v1, u0:u1]), size, flags=SB_FLAGS)
+            part = np.ascontiguousarray(grey[v0:v1, u0:u1])
+            found, corners = cv2.findChessboardCornersSB(part, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
             if found:
                 return corners.reshape(-1, 2) + np.array([u0, v0], np.float32)
     found, corners = cv2.findChessboardCornersSB(grey, size, flags=SB_FLAGS)

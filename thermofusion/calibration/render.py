@@ -88,12 +88,11 @@ def write_folder(
     pictures: Pictures | None = None,
     kinect: Kinect | None = None,
     lens_known: bool = False,
-    board_margin_m: float | None = None,
 ) -> list[Float]:
     """A calibration folder of a simulated afternoon; returns the true T_depth_board of its views.
 
     lens_known : calibration.json gives the true depth lens as the maker's calibration; otherwise a data sheet's,
-    centred. board_margin_m : stated there too.
+    centred.
     """
     pictures, kinect = pictures or Pictures(), kinect or Kinect()
     rng = np.random.default_rng(seed)
@@ -107,19 +106,15 @@ def write_folder(
         _write(root / f"thermal/{i:04d}.png", thermal_picture(rig, T, s[1], pictures, pattern))
         depth_mm = np.round(1e3 * depth_picture(rig, T, s[2], kinect))
         _write(root / f"depth/{i:04d}.png", np.nan_to_num(depth_mm).astype(np.uint16))
-    (root / "calibration.json").write_text(
-        json.dumps(_config(rig, None if lens_known else kinect.sheet_focal, board_margin_m))
-    )
+    (root / "calibration.json").write_text(json.dumps(_config(rig, None if lens_known else kinect.sheet_focal)))
     return poses
 
 
-def _config(rig: SimulatedRig, sheet_focal: float | None, board_margin_m: float | None) -> dict[str, Any]:
+def _config(rig: SimulatedRig, sheet_focal: float | None) -> dict[str, Any]:
     board, lens = rig.board, rig.depth
     w, h, f = lens.width_px, lens.height_px, (sheet_focal or 1) * lens.K[0, 0]
     K = lens.K if sheet_focal is None else np.array([[f, 0, (w - 1) / 2], [0, f, (h - 1) / 2], [0, 0, 1]])
     about = {"kind": board.kind, "columns": board.columns, "rows": board.rows, "spacing_m": board.spacing_m}
-    if board_margin_m is not None:
-        about["margin_m"] = board_margin_m
     camera = {"width_px": w, "height_px": h, "K": K.tolist()}
     return {"board": about, "depth": {"unit_m": 0.001, "lens_known": sheet_focal is None, "camera": camera}}
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import product
 
 import cv2
 import numpy as np
@@ -132,7 +131,7 @@ def _unshifted(found: Detection, spots: NDArray[np.float32], q: Float, board: Bo
     while best is not found:
         best = found
         grid = (found.tried if found.score > 0 else q).reshape(board.rows, board.columns, 2)
-        for across, down in product((-1, 0, 1), repeat=2):
+        for across, down in ((1, 0), (-1, 0), (0, 1), (0, -1)):
             moved = _stepped(_stepped(grid, across, axis=1), down, axis=0)
             found = max(found, complete(spots, moved.reshape(-1, 2)), key=lambda d: d.score)
     return found

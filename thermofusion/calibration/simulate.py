@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -9,11 +10,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry import pose, project, se3_exp
+from ..geometry import distort, pose, project, se3_exp
 from ..types import Camera, Float
 from .board import Board
 from .cameras import rotations
 from .views import BoardPoints, CalibrationSet, View
+
+TRIES = 2000  # of a stand at one distance; nearer than some the board fits into no picture
 
 
 def _camera(w: int, h: int, f: float, center: tuple[float, float], distortion: tuple[float, ...]) -> Camera:
@@ -60,24 +63,28 @@ def board_poses(rig: SimulatedRig, count: int, rng: np.random.Generator) -> list
     center = pose(np.eye(3), np.array([-w / 2, -h / 2, 0]))
     poses: list[Float] = []
     for i in range(count):
-        z = rng.uniform(0.9, 1.8)
-        while True:
+        for attempt in itertools.count():
+            if attempt % TRIES == 0:
+                z = rng.uniform(0.9, 1.8)
             side, tilt = np.radians(90 * i + rng.uniform(-30, 30)), np.radians(rng.uniform(20, 45))
             turn = rotations(np.array([[0, 0, np.radians(rng.uniform(-15, 15))]]))[0]
             R = rotations(np.array([[np.cos(side), np.sin(side), 0]]) * tilt)[0] @ turn
             T = pose(R, np.array([rng.uniform(-0.45, 0.45) * z, rng.uniform(-0.35, 0.35) * z, z])) @ center
-            if all(_inside(rig, name, T) for name in ("color", "thermal", "depth")):
+            if all(_inside(rig, name, T) for name in ("thermal", "color", "depth")):
                 poses.append(T)
                 break
     return poses
 
 
 def _inside(rig: SimulatedRig, name: str, T_depth_board: Float, margin_px: float = 6.0) -> bool:
-    camera, X = rig.camera(name), rig.board.outline_m(0.5)
-    T = rig.T_camera_depth(name) @ T_depth_board
-    uv = project(camera, X @ T[:3, :3].T + T[:3, 3])[0]
-    limit = np.array([camera.width_px, camera.height_px]) - 1 - margin_px
-    return bool(np.isfinite(uv).all() and (uv > margin_px).all() and (uv < limit).all())
+    camera, T = rig.camera(name), rig.T_camera_depth(name) @ T_depth_board
+    x, y, z = T[:3, :3] @ rig.board.outline_m(0.5).T + T[:3, 3:]
+    if (z < 0.1).any() or (x**2 + y**2 > z**2).any():  # no camera here sees 45 deg off its axis
+        return False
+    x, y = distort(x / z, y / z, camera.distortion)
+    uv = camera.K[:2, :2] @ np.stack([x, y]) + camera.K[:2, 2:]
+    limit = np.array([[camera.width_px], [camera.height_px]]) - 1 - margin_px
+    return bool((uv > margin_px).all() and (uv < limit).all())
 
 
 def true_pixels(rig: SimulatedRig, name: str, T_depth_board: Float) -> Float:
