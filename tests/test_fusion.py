@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermofusion import meshing
+from thermofusion import fusion, meshing
 from thermofusion.depthfilter import DepthFrames
 from thermofusion.errors import ResourceError, ScanError
 from thermofusion.fusion import FusionResult, depth_poses, fuse_surface, window_normals
@@ -161,8 +161,9 @@ def test_no_memory_to_begin_with_costs_no_surface(ball) -> None:
     grid, _ = integrate_frames(survey, frames, placed, replace(plan, blocks=1), recipe, None)
     V, F = meshing.canonical(*grid.extract(3))
     assert grid.blocks == expected.blocks_used
-    assert closed(replace(expected.mesh, vertices_m=V, triangles=F))
+    F = meshing.close_pinholes(V, F, fusion.PINHOLE_VOXELS * plan.voxel_m)
     np.testing.assert_array_equal(V, expected.mesh.vertices_m)
+    np.testing.assert_array_equal(F, expected.mesh.triangles)
     assert expected.blocks_used <= expected.blocks_estimated < 2 * expected.blocks_used
 
 
@@ -322,6 +323,25 @@ def test_vertices_take_the_colour_painted_on_them(ball) -> None:
 
 
 # ---------------------------------------------------------------- meshes
+
+
+def test_pinholes_close_and_openings_stay(ball) -> None:
+    """Triangles lost here and there come back as a closed surface of the same side; a hole of 40 mm is an opening."""
+    mesh = ball[2].mesh
+    rng = np.random.default_rng(2)
+    middle = mesh.vertices_m[mesh.triangles].mean(1)
+    far = np.linalg.norm(middle - [0.15, 0, 0], axis=1) > 0.02
+    lost = rng.choice(len(mesh.triangles), 150, replace=False)
+    torn = np.delete(mesh.triangles, lost, axis=0)
+    assert not closed(replace(mesh, triangles=torn))
+    mended = meshing.close_pinholes(mesh.vertices_m, torn, 0.05)
+    assert closed(replace(mesh, triangles=mended))
+    np.testing.assert_allclose(
+        meshing.vertex_areas(mesh.vertices_m, mended).sum(), meshing.vertex_areas(mesh.vertices_m, mesh.triangles).sum()
+    )
+    np.testing.assert_array_equal(
+        meshing.close_pinholes(mesh.vertices_m, mesh.triangles[far], 0.05), mesh.triangles[far]
+    )
 
 
 def test_canonical_order_depends_on_the_shape_alone(ball) -> None:

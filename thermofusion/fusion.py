@@ -35,6 +35,7 @@ PLANE_AGREES_COS = 0.8  # 37°: a plane fit farther from the mesh's own normal c
 SEEN_TRUNCATIONS = 2.0  # a vertex is on a frame's surface if nearer to it than this, in truncations
 VOTE_SHARE = 0.05  # of what a frame sees; less is a hand in front or a chair's leg
 MAX_PLANES = 3  # a floor and two walls
+PINHOLE_VOXELS = 14.0  # round a hole of two voxels' radius
 MAX_WALK_M = 100.0  # a camera path longer across than this is in another unit
 
 
@@ -111,6 +112,7 @@ def fuse_surface(
             place=scan.root,
             hint="set subject.background = keep, or a smaller subject.min_component_cm2",
         )
+    triangles = meshing.close_pinholes(vertices, triangles, PINHOLE_VOXELS * plan.voxel_m)
     vertices = meshing.smooth_positions(vertices, triangles, recipe.fusion.smooth_iterations)
     normals = window_normals(vertices, triangles, recipe.fusion.normal_window_mm / 1e3)
     color = None

@@ -33,9 +33,14 @@ def canonical(vertices: Float32, triangles: NDArray) -> tuple[Float32, Int]:
     new[order] = np.cumsum(first) - 1
     tri = new[triangles]
     tri = tri[(tri[:, 0] != tri[:, 1]) & (tri[:, 1] != tri[:, 2]) & (tri[:, 2] != tri[:, 0])]
-    lead = tri.argmin(1)[:, None]
-    tri = np.take_along_axis(tri, (lead + np.arange(3)) % 3, axis=1)
-    return ordered[first], tri[np.lexsort((tri[:, 2], tri[:, 1], tri[:, 0]))]
+    return ordered[first], _in_order(tri)
+
+
+def _in_order(triangles: Int) -> Int:
+    """Triangles that start at their lowest vertex, sorted."""
+    lead = triangles.argmin(1)[:, None]
+    tri = np.take_along_axis(triangles, (lead + np.arange(3)) % 3, axis=1)
+    return tri[np.lexsort((tri[:, 2], tri[:, 1], tri[:, 0]))]
 
 
 def triangle_normals(vertices: Float32, triangles: Int) -> Float32:
@@ -71,6 +76,35 @@ def keep_vertices(vertices: Float32, triangles: Int, keep: Bool) -> tuple[Float3
     used[tri] = True
     new = np.cumsum(used, dtype=np.int32) - 1
     return vertices[used], new[tri]
+
+
+def close_pinholes(vertices: Float32, triangles: Int, max_round_m: float) -> Int:
+    """The triangles in `canonical` order, with fans over holes whose border is no longer than `max_round_m`.
+
+    A pinhole is a voxel that too few frames filled. It is no edge of the subject, but would be taken for one wherever
+    silhouettes and open borders are kept clear of. No vertex is added. Holes that touch in a vertex stay open.
+    """
+    a, b = triangles[:, [0, 1, 2]].ravel().astype(np.int64), triangles[:, [1, 2, 0]].ravel().astype(np.int64)
+    n = len(vertices)
+    open_ = ~np.isin(a * n + b, b * n + a)
+    a, b = a[open_], b[open_]
+    lone = (np.bincount(a, minlength=n)[a] == 1) & (np.bincount(b, minlength=n)[b] == 1)
+    follower = dict(zip(a[lone].tolist(), b[lone].tolist(), strict=True))
+    fans: list[tuple[int, int, int]] = []
+    while follower:
+        start, following = follower.popitem()
+        loop = [start]
+        while following != start and following in follower:
+            loop.append(following)
+            following = follower.pop(following)
+        border = vertices[loop]
+        length = float(np.linalg.norm(border - np.roll(border, -1, axis=0), axis=1).sum())
+        if following == start and 3 <= len(loop) and length <= max_round_m:
+            loop = loop[(k := int(np.argmin(loop))) :] + loop[:k]  # whatever the border's start
+            fans += [(loop[0], loop[i + 1], loop[i]) for i in range(1, len(loop) - 1)]
+    if not fans:
+        return triangles
+    return _in_order(np.concatenate([triangles, np.array(fans, np.int32)]))
 
 
 def smooth_positions(vertices: Float32, triangles: Int, iterations: int) -> Float32:

@@ -84,7 +84,7 @@ class FusionSection(_Section):
         "auto", description="edge of a voxel; auto: from depth noise and thermal footprint"
     )
     truncation_voxels: Literal["auto"] | float = Field(
-        "auto", description="TSDF truncation in voxels; auto: 6 times the depth noise, at least 3 voxels and 8 mm"
+        "auto", description="TSDF truncation in voxels; auto: 3.5 times the depth noise, at least 2.5 voxels and 8 mm"
     )
     min_weight: float = Field(3.0, ge=0, description="surface seen by fewer depth frames is dropped")
     normal_window_mm: float = Field(
