@@ -24,8 +24,8 @@ def rig():
 
 
 def test_pictures_calibrate_the_rig_within_its_own_intervals(rig, tmp_path):
-    """The long form, 50 seeds of 24 views, is benchmarks/calibration_coverage.py pictures: there thermal to depth is good
-    to 0.035 deg and 0.51 mm (95th percentile), thermal to colour to 0.023 deg and 0.10 mm; 16 views give a little less."""
+    """The long form, 50 seeds of 24 views, is benchmarks/calibration_coverage.py pictures: thermal to depth 0.035 deg
+    and 0.51 mm, thermal to colour 0.023 deg and 0.10 mm (95th percentile). 16 views give a little less."""
     poses = write_folder(tmp_path / "day", rig, 0, views=16, kinect=Kinect.drawn(0), lens_known=True)
     found = calibrate(tmp_path / "day")
     c = found.calibration
