@@ -84,10 +84,11 @@ def close_pinholes(vertices: Float32, triangles: Int, max_round_m: float) -> Int
     A pinhole is a voxel that too few frames filled. It is no edge of the subject, but would be taken for one wherever
     silhouettes and open borders are kept clear of. No vertex is added. Holes that touch in a vertex stay open.
     """
-    a, b = triangles[:, [0, 1, 2]].ravel().astype(np.int64), triangles[:, [1, 2, 0]].ravel().astype(np.int64)
     n = len(vertices)
-    open_ = ~np.isin(a * n + b, b * n + a)
-    a, b = a[open_], b[open_]
+    ends = (triangles.ravel(), triangles[:, [1, 2, 0]].ravel())
+    along = csr_matrix((np.ones(len(ends[0]), np.int8), ends), shape=(n, n))
+    once = (along - along.T).tocoo()  # edges that no other triangle runs back along
+    a, b = once.row[once.data > 0], once.col[once.data > 0]
     lone = (np.bincount(a, minlength=n)[a] == 1) & (np.bincount(b, minlength=n)[b] == 1)
     follower = dict(zip(a[lone].tolist(), b[lone].tolist(), strict=True))
     fans: list[tuple[int, int, int]] = []
@@ -99,7 +100,7 @@ def close_pinholes(vertices: Float32, triangles: Int, max_round_m: float) -> Int
             following = follower.pop(following)
         border = vertices[loop]
         length = float(np.linalg.norm(border - np.roll(border, -1, axis=0), axis=1).sum())
-        if following == start and 3 <= len(loop) and length <= max_round_m:
+        if following == start and len(loop) >= 3 and length <= max_round_m:
             loop = loop[(k := int(np.argmin(loop))) :] + loop[:k]  # whatever the border's start
             fans += [(loop[0], loop[i + 1], loop[i]) for i in range(1, len(loop) - 1)]
     if not fans:

@@ -18,7 +18,7 @@ from .types import Float, Int
 TUKEY = 4.685  # 95 % efficient for normal errors
 HUBER = 1.345
 HUBER_STEPS, TUKEY_STEPS = 4, 40
-CONVERGED_K = 2e-5
+CONVERGED_K = 1e-4  # a hundredth of what any result is good to
 OFFSET_PRIOR_K = 5.0  # spread of offsets about their mean: only matters for views that overlap with none
 FIELD_PRIOR_K = {1: 0.15, 2: 0.15, 3: 0.07, 4: 0.07}  # rms of a field pattern by polynomial order; 0.1-0.3 K together
 FIELD_UNKNOWN_K, FIELD_MEMORY = 0.3, 0.25  # one sigma of the field's change over this share of the image width
@@ -55,8 +55,10 @@ class Level:
 
 @dataclass(frozen=True)
 class KnownField:
-    """The place at which the field is read for a reference: its own, or the nearest at which skin was seen. A polynomial
-    says nothing beyond its data: there the field is held, and less certain with the distance `away` [image widths]."""
+    """The place at which the field is read for a reference: its own, or the nearest at which skin was seen.
+
+    A polynomial says nothing beyond its data: there the field is held, less certain with the distance `away` [image
+    widths]."""
 
     u_px: float
     v_px: float
@@ -82,8 +84,9 @@ class OverlapSystem:
 
     x holds the camera's gain 1 + γ. columns : (N, K + 2): field patterns, D·x of the last step, L_r - pivot.
     group : (N,) the offset's index. keep : (K_all, K) combinations of the field's patterns that are solved for.
-    order, start : rows by vertex. reading_places : where the field is taken for each reading. correlated : how many vertices err alike (neighbours share
-    their normal, and all share rig and shape): the data's information is divided by it where it meets other knowledge.
+    order, start : rows by vertex. reading_places : where the field is taken for each reading. correlated : how many
+    vertices err alike (neighbours share their normal, and all share rig and shape): the data's information is divided
+    by it where it meets other knowledge.
     """
 
     vertex: Int

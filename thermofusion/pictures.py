@@ -21,7 +21,7 @@ from .export.axes import axes_of, axes_rotation
 from .export.files import write_whole
 from .lettering import INK, QUIET
 from .raycasts import RAYS, Cast, cast_views
-from .types import Float32, ThermalMesh, UInt8
+from .types import Float, Float32, SurfaceMesh, ThermalMesh, UInt8
 
 UNMEASURED_RGB = ((226, 226, 226), (190, 190, 190))  # stripes falling to the left,
 INSIDE_RGB = ((112, 112, 112), (84, 84, 84))  # and to the right: no palette can be mistaken for either
@@ -102,9 +102,10 @@ def write_views(
     palette: str = "inferno",
     range_degC: tuple[float, float] | None = None,
     height_px: int = 900,
+    casts: list[Cast] | None = None,
 ) -> list[Path]:
     """Write `front.png` … `overview.png` into a folder, made if need be. Raises as `render_views`, ResourceError."""
-    pictures = render_views(mesh, palette=palette, range_degC=range_degC, height_px=height_px)
+    pictures = render_views(mesh, palette=palette, range_degC=range_degC, height_px=height_px, casts=casts)
     paths = [Path(folder) / f"{name}.png" for name in pictures]
     with ThreadPoolExecutor(max_workers=2) as pool:
         return list(pool.map(write_png, paths, pictures.values()))
@@ -133,7 +134,12 @@ def cast_mesh(
     axes = axes_of(mesh.metadata)
     if up is not None or front is not None:
         axes = axes_rotation(axes[1] if up is None else up, axes[2] if front is None else front)
-    return cast_views(mesh.surface, axes, height_px - _Page(height_px).chrome_px)
+    return cast_surface(mesh.surface, axes, height_px=height_px)
+
+
+def cast_surface(surface: SurfaceMesh, axes: Float, *, height_px: int = 900) -> list[Cast]:
+    """The same before there are temperatures. axes : (3, 3), rows right, up and front (`export.axes_of`)."""
+    return cast_views(surface, axes, height_px - _Page(height_px).chrome_px)
 
 
 def draw(casts: list[Cast], values: NDArray, scale: Scale, *, height_px: int) -> dict[str, UInt8]:

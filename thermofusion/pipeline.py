@@ -9,6 +9,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,11 +20,12 @@ from .errors import RecipeError, ScanError
 from .recipe import Recipe
 from .report.summary import result_report, summary
 from .rundir import StagePlan, Stages, fingerprint, load_artifact, save_artifact, to_json, write_text
-from .types import Scan, ThermalMesh, Trajectory
+from .types import Scan, SurfaceMesh, ThermalMesh, Trajectory
 
 if TYPE_CHECKING:
     from .alignment import AlignmentResult
     from .fusion import FusionResult
+    from .raycasts import Cast
     from .thermometry import Seen, Temperature
     from .tracking import TrackingResult
 
@@ -101,7 +103,7 @@ def fuse(
     tracking = run("track", lambda p: locate(scan, recipe, p))
     trajectory = tracking.trajectory
     surface = run("surface", lambda p: fuse_subject(scan, tracking, recipe, p))
-    alignment = seen = temperature = None
+    alignment = seen = temperature = casts = None
     if surface is not None and scan.thermal is None:
         temperature = unmeasured(scan, surface.mesh, recipe, _axes(scan, tracking, surface))
     elif surface is not None:
@@ -109,18 +111,18 @@ def fuse(
         alignment = run("align", lambda p: align_thermal(scan, surface.mesh, trajectory, recipe))
         # 3. Mapping
         seen = run("observe", lambda p: see(scan, surface.mesh, trajectory, alignment, recipe))
-        # 4. Temperature
+        # 4. Temperature, while the pictures' rays are cast on the other core
+        axes = _axes(scan, tracking, surface)
+        if folder is not None and until is None and recipe.output.views:
+            casts = _casting(surface.mesh, axes)
         temperature = run(
-            "temperature",
-            lambda p: measure(
-                scan, surface.mesh, seen, recipe, axes=_axes(scan, tracking, surface), compare=compare_methods
-            ),
+            "temperature", lambda p: measure(scan, surface.mesh, seen, recipe, axes=axes, compare=compare_methods)
         )
 
     report = result_report(scan, recipe, tracking, surface, alignment, seen, temperature, stages.reused)
     result = Result(report, trajectory, tracking, surface, alignment, seen, temperature)
     if folder is not None:
-        write_result(result, recipe, folder)
+        write_result(result, recipe, folder, casts)
     return result
 
 
@@ -155,8 +157,11 @@ def plan(scan: Scan, recipe: Recipe, out: Path, *, redo_from: str | None = None)
     return [stages.plan(name, _inputs(name, recipe)) for name in STAGES]
 
 
-def write_result(result: Result, recipe: Recipe, folder: Path) -> None:
-    """The result folder's files (docs/formats.md), each whole or not at all; `result.json` comes last."""
+def write_result(result: Result, recipe: Recipe, folder: Path, casts: Future[list[Cast]] | None = None) -> None:
+    """The result folder's files (docs/formats.md), each whole or not at all; `result.json` comes last.
+
+    casts : the pictures' rays, if they were cast meanwhile.
+    """
     from .export import export, write_trajectory
     from .pictures import write_views
 
@@ -167,7 +172,8 @@ def write_result(result: Result, recipe: Recipe, folder: Path) -> None:
         export(mesh, folder, tuple(output.formats), palette=output.palette, range_degC=output.range_degC)
         save_artifact(folder / "result.npz", result.temperature)
         if output.views:
-            write_views(mesh, folder / "views", palette=output.palette, range_degC=output.range_degC)
+            cast = None if casts is None else casts.result()
+            write_views(mesh, folder / "views", palette=output.palette, range_degC=output.range_degC, casts=cast)
     write_text(folder / "result.json", to_json(result.report))
 
 
@@ -179,6 +185,16 @@ def load_mesh(folder: Path, show: str = "absolute") -> ThermalMesh:
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as e:
         raise ScanError(f"no finished result is here ({e})", place=path, hint="run `thermofusion run` first") from None
     return temperature.shown(show)
+
+
+def _casting(surface: SurfaceMesh, axes: dict[str, str]) -> Future[list[Cast]]:
+    from .export import axes_of
+    from .pictures import cast_surface
+
+    pool = ThreadPoolExecutor(max_workers=1)
+    casts = pool.submit(cast_surface, surface, axes_of(axes))
+    pool.shutdown(wait=False)
+    return casts
 
 
 def _axes(scan: Scan, tracking: TrackingResult, surface: FusionResult) -> dict[str, str]:

@@ -150,7 +150,7 @@ class Uncertainty:
 
     @property
     def absolute_K(self) -> Float32:
-        """(V,) one sigma of a single vertex's temperature on an absolute scale: all parts, and all of what is common."""
+        """(V,) one sigma of a vertex's temperature on an absolute scale: its parts, and all of what is common."""
         own = {name: value for name, value in self.parts_K.items() if name not in self.common_K}
         squares = [v.astype(np.float64) ** 2 for v in (*own.values(), *self.common_K.values())]
         return np.sqrt(np.sum(squares, axis=0)).astype(np.float32)
