@@ -3,10 +3,11 @@
     python tests/benchmarks/calibration_coverage.py pictures [seeds] [views]
     python tests/benchmarks/calibration_coverage.py [fine] [seeds] [views]
 
-`pictures`: whole folders of colour, thermal and depth pictures (blur, noise, pins of either sign, missing pins, a
-Kinect's disparity), read, detected and adjusted by `calibrate`; every seed with another depth camera. Once with the
-depth lens unknown, once with the maker's calibration of it. Otherwise points with the noise of picks by hand, or
-(`fine`) of 0.05 px in colour and 0.1 px in thermal pictures and the depth lens known.
+`pictures`: whole folders of colour, thermal, depth and infrared pictures (blur, noise, pins of either sign, missing
+pins, a Kinect's disparity), read, detected and adjusted by `calibrate`; every seed with another depth camera. Without
+the infrared pictures and the depth lens unknown, then with the maker's calibration of it, then with the infrared ones.
+Otherwise points with the noise of picks by hand, or (`fine`) of 0.05 px in colour and 0.1 px in thermal pictures and
+the depth lens known.
 
 Prints the share of true values inside their intervals by kind of number, and the errors of the extrinsics.
 """
@@ -15,6 +16,7 @@ from __future__ import annotations
 
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -66,12 +68,18 @@ def from_pictures(seed: int, views: int) -> dict[str, Result]:
     rig = SimulatedRig()
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
-        poses = write_folder(root, rig, seed, views=views, kinect=Kinect.drawn(seed))
+        poses = write_folder(root, rig, seed, views=views, kinect=Kinect.drawn(seed), infrared=True)
         found = calibrate(root)
-        c = found.calibration
-        images = {n: (lambda n=n: found.folder.depth(n)) for n in found.folder.files["depth"]}
-        known = calibrate_views(c.data, depth_images=images, depth_camera=rig.depth, depth_lens_known=True)
-    out = {"depth lens unknown": judged(rig, c), "depth lens known": judged(rig, known)}
+        full, folder_ = found.calibration, found.folder
+        images = {n: (lambda n=n: folder_.depth(n)) for n in folder_.files["depth"]}
+        blind = replace(full.data, views=tuple(v.with_points("depth", None) for v in full.data.views))
+        c = calibrate_views(blind, depth_images=images, depth_camera=folder_.depth_camera)
+        known = calibrate_views(blind, depth_images=images, depth_camera=rig.depth, depth_lens_known=True)
+    out = {
+        "depth lens unknown": judged(rig, c),
+        "depth lens known": judged(rig, known),
+        "infrared pictures, lens unknown": judged(rig, full),
+    }
     for camera in ("color", "thermal"):
         e = [
             v.points[camera].px - true_pixels(rig, camera, poses[int(v.name)])[v.points[camera].index]

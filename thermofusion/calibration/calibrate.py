@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +44,7 @@ class Calibrated:
 
     def picture(self, camera: str, name: str) -> UInt8:
         """(H, W, 3) RGB: the view's picture with accepted points as green rings, rejected ones as red crosses."""
-        image = getattr(self.folder, camera)(name)
+        image = getattr(self.folder, "infrared" if camera == "depth" else camera)(name)
         view = next((v for v in self.calibration.data.views if v.name == name), None)
         points = view.points.get(camera) if view is not None else None
         accepted = np.zeros((0, 2)) if points is None else points.px
@@ -73,6 +73,8 @@ def calibrate(
         data = _from_picks(folder, source)
     else:
         data, rejected = _detect(folder, progress)
+        if "infrared" in folder.files:
+            data = _with_infrared(folder, data, progress)
     depth: dict[str, Callable[[], NDArray]] = {
         n: _loader(folder, n) for n in folder.files.get("depth", {}) if any(v.name == n for v in data.views)
     }
@@ -114,9 +116,9 @@ def _from_picks(folder: CalibrationFolder, path: Path) -> CalibrationSet:
         return CalibrationSet(board, sizes, tuple(views))
     views = read_picks_csv(path, folder.board)
     sizes = {}
-    for camera in ("color", "thermal"):
-        if folder.files.get(camera):
-            image = getattr(folder, camera)(next(iter(folder.files[camera])))
+    for camera, files in (("color", "color"), ("thermal", "thermal"), ("depth", "infrared")):
+        if folder.files.get(files):
+            image = getattr(folder, files)(next(iter(folder.files[files])))
             sizes[camera] = (image.shape[1], image.shape[0])
     return CalibrationSet(folder.board, sizes, tuple(sorted(views, key=lambda v: v.name)))
 
@@ -157,6 +159,14 @@ def _detect(folder: CalibrationFolder, progress: Progress) -> tuple[CalibrationS
     data, detections = detect_thermal_set(CalibrationSet(folder.board, sizes, tuple(views.values())), images)
     rejected["thermal"] = {n: d.tried[~d.accepted] for n, d in detections.items()}
     return data, rejected
+
+
+def _with_infrared(folder: CalibrationFolder, data: CalibrationSet, progress: Progress) -> CalibrationSet:
+    """The set with the depth camera's points, from its own pictures."""
+    progress("looking for the board in the infrared pictures")
+    found, size = _find(folder, "infrared", detect_patches)
+    views = tuple(v.with_points("depth", found.get(v.name)) for v in data.views)
+    return replace(data, image_size={**data.image_size, "depth": size}, views=views)
 
 
 def detect_patches(image: NDArray, board: Board) -> BoardPoints | None:

@@ -59,6 +59,8 @@ def fit_with_depth(
     if "depth" not in fit.problem.slices:
         x[problem.slices["depth"]] = intrinsics_of(depth_camera)
         x[problem.slices[key]] = to_rt(T_depth_hub)
+    if depth_lens_known:
+        x[problem.slices["depth"]] = intrinsics_of(depth_camera)
     x[problem.slices["depth_model"]] = model.start()
     fixed = set(fit.options.fixed) - {"spacing"}
     fixed |= {"depth_model"} if free_spacing else {"spacing"}

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry import project
+from ..geometry import project, undistort
 from ..types import Camera, Float
 from .views import DepthSamples
 
@@ -61,7 +61,17 @@ def sample_board(
     out = level + mean(raw - fitted) if disparity else (1 + mean(raw * fitted - 1)) / level
     noise: NDArray | float = max(spread, QUANTUM_DISPARITY) if disparity else max(spread, METRIC_NOISE) * out**2
     sigma = np.broadcast_to(noise, out.shape)
-    return DepthSamples(mean(u), mean(v), out, sigma / np.sqrt(np.maximum(count[full] / CORRELATED_PIXELS, 1)))
+    px, py = _straightened(camera, mean(u), mean(v))
+    return DepthSamples(px, py, out, sigma / np.sqrt(np.maximum(count[full] / CORRELATED_PIXELS, 1)))
+
+
+def _straightened(camera: Camera, u: Float, v: Float) -> tuple[Float, Float]:
+    """Pixels as the same lens without distortion would have them: the plane's depth is taken along straight rays."""
+    if not np.any(camera.distortion):
+        return u, v
+    K = camera.K
+    x, y = undistort((u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], camera.distortion)
+    return x * K[0, 0] + K[0, 2], y * K[1, 1] + K[1, 2]
 
 
 def _on_plane(u: NDArray, v: NDArray, y: Float) -> tuple[Float, NDArray, float]:

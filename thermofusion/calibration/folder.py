@@ -2,13 +2,15 @@
 
 ```json
 {"board": {"kind": "pins", "columns": 9, "rows": 9, "spacing_m": 0.0762},
- "files": {"color": "color/*.png", "thermal": "thermal/*.png", "depth": "depth/*.png"},
+ "files": {"color": "color/*.png", "thermal": "thermal/*.png", "depth": "depth/*.png",
+           "infrared": "infrared/*.png"},
  "depth": {"unit_m": 0.001, "invalid": [0], "kind": "metric",
            "camera": {"width_px": 640, "height_px": 480, "K": [[...]]}, "lens_known": false},
  "thermal_raw": {"width_px": 632, "height_px": 476, "big_endian": true, "header_bytes": 0},
  "picks": "picks.csv", "free_spacing": false, "mirrored": []}
 ```
-The star in a pattern is the view's name: the same name in two patterns is the same moment. Only `board` is required.
+`infrared` are pictures of the depth camera itself, pixel for pixel with its depth. The star in a pattern is the view's
+name: the same name in two patterns is the same moment. Only `board` is required.
 """
 
 from __future__ import annotations
@@ -73,7 +75,7 @@ class _RawDoc(_Strict):
 
 class _Config(_Strict):
     board: _BoardDoc
-    files: dict[Literal["color", "thermal", "depth"], str] = {}
+    files: dict[Literal["color", "thermal", "depth", "infrared"], str] = {}
     depth: _DepthDoc = _DepthDoc()
     thermal_raw: _RawDoc | None = None
     picks: str | None = None
@@ -129,6 +131,14 @@ class CalibrationFolder:
             return self._turned(np.where(none, np.float32(np.nan), raw.astype(np.float32)), "depth")
         return self._turned(depth_from_raw(raw, d.unit_m, place=path, invalid=tuple(d.invalid)), "depth")
 
+    def infrared(self, name: str) -> NDArray[np.uint8]:
+        """(H, W) 8-bit grey of the depth camera's own infrared picture, its contrast stretched."""
+        image = read_image(self.files["infrared"][name], kind="infrared")
+        grey = (image if image.ndim == 2 else image[..., 0]).astype(np.float32)
+        lo, hi = np.percentile(grey, [0.5, 99.5])
+        stretched = np.clip((grey - lo) * (255 / max(hi - lo, 1e-6)), 0, 255)
+        return self._turned(np.round(stretched).astype(np.uint8), "depth")
+
     def _turned(self, image: NDArray, camera: str) -> NDArray:
         return image[:, ::-1] if camera in self.mirrored else image
 
@@ -155,7 +165,7 @@ def open_folder(
     if not root.is_dir():
         raise ScanError("there is no such calibration folder", place=root)
     c = _load(root, config, board)
-    patterns = dict(c.files) or {k: f"{k}/*" for k in ("color", "thermal", "depth")}
+    patterns = dict(c.files) or {k: f"{k}/*" for k in ("color", "thermal", "depth", "infrared")}
     files = {str(k): _matching(root, p) for k, p in patterns.items()}
     files = {k: f for k, f in files.items() if f}
     if not files:

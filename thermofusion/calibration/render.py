@@ -88,22 +88,25 @@ def write_folder(
     pictures: Pictures | None = None,
     kinect: Kinect | None = None,
     lens_known: bool = False,
+    infrared: bool = False,
 ) -> list[Float]:
     """A calibration folder of a simulated afternoon; returns the true T_depth_board of its views.
 
     lens_known : calibration.json gives the true depth lens as the maker's calibration; otherwise a data sheet's,
-    centred.
+    centred. infrared : the depth camera's own pictures too.
     """
     pictures, kinect = pictures or Pictures(), kinect or Kinect()
     rng = np.random.default_rng(seed)
     poses = board_poses(rig, views, rng)
     pattern = sensor_pattern(rig.thermal, pictures.thermal_pattern, rng)
-    for camera in ("color", "thermal", "depth"):
+    for camera in ("color", "thermal", "depth", *(["infrared"] if infrared else [])):
         (root / camera).mkdir(parents=True)
     for i, T in enumerate(poses):
         s = [int(k) for k in rng.integers(2**31, size=3)]
         _write(root / f"color/{i:04d}.png", color_picture(rig, T, s[0], pictures))
         _write(root / f"thermal/{i:04d}.png", thermal_picture(rig, T, s[1], pictures, pattern))
+        if infrared:
+            _write(root / f"infrared/{i:04d}.png", color_picture(rig, T, s[0] + 1, pictures, "depth"))
         depth_mm = np.round(1e3 * depth_picture(rig, T, s[2], kinect))
         _write(root / f"depth/{i:04d}.png", np.nan_to_num(depth_mm).astype(np.uint16))
     (root / "calibration.json").write_text(json.dumps(_config(rig, None if lens_known else kinect.sheet_focal)))
@@ -126,11 +129,16 @@ def _write(path: Path, image: NDArray) -> None:
 # ---------------------------------------------------------------- colour
 
 
-def color_picture(rig: SimulatedRig, T_depth_board: Float, seed: int, look: Pictures) -> NDArray[np.uint8]:
-    """(H, W) grey levels: squares and white rim under uneven light before a blotchy wall; lens blur, noise, 8 bit."""
-    rng, camera = np.random.default_rng(seed), rig.color
+def color_picture(
+    rig: SimulatedRig, T_depth_board: Float, seed: int, look: Pictures, name: str = "color"
+) -> NDArray[np.uint8]:
+    """(H, W) grey levels: squares and white rim under uneven light before a blotchy wall; lens blur, noise, 8 bit.
+
+    name : `color`, or `depth` for the depth camera's infrared picture.
+    """
+    rng, camera = np.random.default_rng(seed), rig.camera(name)
     image = _blotches(rng, camera, 90, 25)
-    here, at = _board_xy(rig, "color", T_depth_board)
+    here, at = _board_xy(rig, name, T_depth_board)
     x, y, c, r = at.x, at.y, rig.board.columns - 1, rig.board.rows - 1
     dark = _squares(at) * at.inside(c, r, 0.0)
     gx, gy = (np.float32(g) for g in rng.uniform(-0.25, 0.25, 2))

@@ -88,10 +88,20 @@ def calibrate_views(
     if depth_images:
         lens = depth_camera or default_depth_camera(depth_images)
         size = (lens.width_px, lens.height_px)
+        if data.image_size.get("depth", size) != size:
+            raise ScanError(
+                "the infrared pictures are {} x {} px, the depth images {} x {}".format(
+                    *data.image_size["depth"], *size
+                ),
+                hint="crop them to the same pixels: both must be one camera's",
+            )
         model = DisparityDepth(size) if depth_kind == "disparity" else MetricDepth(size)
         guess = np.eye(4) if T_depth_hub is None else T_depth_hub
         T, margin = guess, -0.1
         points = fit
+        if "depth" in single:  # infrared pictures say where the depth camera is
+            T, margin = from_rt(fit.block(f"T_depth_{fit.problem.hub}")), 0.0
+            lens = lens if depth_lens_known else camera_of(fit.block("depth"), size)
         if depth_kind == "metric":
             check_depth_orientation(data, depth_images, lens, T, fit)
         for turn in range(3):  # again, knowing where the board lies in the depth image

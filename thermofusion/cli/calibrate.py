@@ -52,7 +52,7 @@ def calibrate(
         document["radiometry"] = {k: getattr(radiometry, k) for k in ("counts_range", "residual_K", "sigma_K")}
     write_rig(out, document)
     names = [(c, v.name) for v in done.calibration.data.views for c in v.points][:PICTURES_IN_REPORT]
-    pictures = {f"{camera} {name}": done.picture(camera, name) for camera, name in names if camera != "depth"}
+    pictures = {f"{camera} {name}": done.picture(camera, name) for camera, name in names}
     page = report or out.with_suffix(".html")
     write_text(page, report_html(done.calibration, advice=done.advice, pictures=pictures))
     lines = [f"{camera:<8} {n} views with the board" for camera, n in done.found.items()]
