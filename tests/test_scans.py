@@ -12,6 +12,7 @@ import pytest
 import scan_maker as make
 from conftest import ROOT
 
+from thermofusion.calibration.depth_model import MetricDepth
 from thermofusion.check import check_scan, missing_metadata, overlays, verify
 from thermofusion.errors import RecipeError, ScanError
 from thermofusion.geometry import backproject, pose, project, se3_exp, transform_points
@@ -517,6 +518,36 @@ def test_with_rig_shows_another_rig(tmp_path):
     tree["extrinsics"]["T_thermal_depth"][0][3] = 0.05
     (tmp_path / "rig.json").write_text(json.dumps({k: tree[k] for k in ("cameras", "extrinsics")}))
     assert with_rig(scan, tmp_path / "rig.json").rig.T_thermal_depth[0, 3] == 0.05
+
+
+def test_a_rigs_depth_correction_reaches_the_depth_images(tmp_path):
+    scan = make.tiny_scan()
+    h, w = scan.rig.depth.shape
+    model = MetricDepth((w, h))
+    theta = np.random.default_rng(0).normal(0, 1, len(model.names)) * model.prior_sigma()
+    tree = {k: v for k, v in scan_json(scan).items() if k in ("cameras", "extrinsics")}
+    tree["depth_correction"] = {"model": "metric", "parameters": dict(zip(model.names, theta.tolist(), strict=True))}
+    path = tmp_path / "rig.json"
+    path.write_text(json.dumps(tree))
+    corrected, before = with_rig(scan, path), scan.depth.load(0)
+    v, u = np.nonzero(np.isfinite(before))
+    expected = model.to_depth_m(theta, before[v, u], u, v)
+    assert np.abs(expected - before[v, u]).max() > 2e-3
+    np.testing.assert_allclose(corrected.depth.load(0)[v, u], expected, atol=1e-6)
+    write_scan(corrected, tmp_path / "native")
+    again = open_scan(tmp_path / "native").depth.load(0)
+    np.testing.assert_allclose(again[v, u], expected, atol=0.13e-3)
+    np.testing.assert_array_equal(np.isnan(again), np.isnan(before))
+
+    tree["depth_correction"]["parameters"].pop("offset_m")
+    path.write_text(json.dumps(tree))
+    with pytest.raises(ScanError, match="offset_m"):
+        with_rig(scan, path)
+    tree["depth_correction"]["model"] = "disparity"
+    path.write_text(json.dumps(tree))
+    kept = with_rig(scan, path)
+    np.testing.assert_array_equal(kept.depth.load(0), before)
+    assert "raw disparity" in kept.notes[-1]
 
 
 # ---------------------------------------------------------------- real recordings

@@ -8,6 +8,7 @@ seen, and not at disparity 0, where nobody looks and a little more decay would b
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -75,6 +76,14 @@ class MetricDepth:
         """True depth along z of reported depth (N,), metres."""
         z = np.asarray(value, np.float64)
         return z + self._basis(z, u_px, v_px) @ theta
+
+    def of_images(self, theta: Float) -> Callable[[NDArray], NDArray[np.float32]]:
+        """`to_depth_m` for whole images (H, W) of metres, NaN none."""
+        w, h = self.size
+        v, u = np.mgrid[0:h, 0:w].reshape(2, -1)
+        bend = (field_basis(u, v, self.size) @ theta[2:]).astype(np.float32).reshape(h, w)
+        gain, offset = np.float32(1 + theta[0]), np.float32(theta[1])
+        return lambda z: np.asarray(z * (gain + z * bend) + offset, np.float32)
 
 
 @dataclass(frozen=True)

@@ -143,11 +143,19 @@ class RigCamerasDoc(Border):
     thermal: RigThermalDoc | None = None
 
 
+class DepthCorrectionDoc(Border):
+    """What calibration found of the depth camera's own error (`calibration.depth_model`)."""
+
+    model: Literal["metric", "disparity"]
+    parameters: dict[str, float]
+
+
 class RigDoc(Border):
-    """rig.json: the `cameras` and `extrinsics` groups of a scan.json, each camera optional."""
+    """rig.json: the `cameras` and `extrinsics` groups of a scan.json, each camera optional; the depth's correction."""
 
     cameras: RigCamerasDoc
     extrinsics: ExtrinsicsDoc = ExtrinsicsDoc()
+    depth_correction: DepthCorrectionDoc | None = None
 
 
 Doc = TypeVar("Doc", bound=BaseModel)
