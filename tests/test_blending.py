@@ -12,8 +12,9 @@ from thermofusion.blending import blend, remove_air_path
 from thermofusion.crosscal import cross_calibrate
 from thermofusion.emissivity import Blackbody, Fresnel
 from thermofusion.radiometry import ZERO_DEGC_K, apparent_radiance, paper_chain
-from thermofusion.recipe import RadiometrySection
-from thermofusion.types import Observations
+from thermofusion.recipe import RadiometrySection, load_recipe
+from thermofusion.thermometry import error_model
+from thermofusion.types import Observations, SignalCurve, ThermalSensor
 from thermofusion.uncertainty import (
     BILINEAR_VARIANCE,
     AngleTables,
@@ -274,3 +275,11 @@ def calibration_of(world, readings, L_r, errors):
         errors=errors,
         blackbodies=readings,
     )
+
+
+@pytest.mark.parametrize(("measured", "used"), [(None, 0.7), (1.3, 1.3)])
+def test_a_measured_point_spread_enters_the_budget(measured, used):
+    sensor = ThermalSensor(SignalCurve(), psf_sigma_px=measured)
+    errors = error_model(sensor, load_recipe("torso"))
+    assert errors.psf_sigma_px == used
+    assert errors.netd_K == sensor.netd_K

@@ -318,6 +318,7 @@ def error_model(sensor: ThermalSensor, recipe: Recipe) -> ErrorModel:
     r = recipe.radiometry
     return ErrorModel(
         netd_K=sensor.netd_K,
+        psf_sigma_px=ErrorModel.psf_sigma_px if sensor.psf_sigma_px is None else sensor.psf_sigma_px,
         sigma_normal_deg=DEFAULT_SIGMA_NORMAL_DEG if r.sigma_normal_deg is None else r.sigma_normal_deg,
         sigma_shape=r.sigma_shape,
         sigma_registration_px=r.sigma_registration_px,
