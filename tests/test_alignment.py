@@ -74,6 +74,20 @@ def test_wrong_rig_and_clock_are_found(body, scan, rotation_deg, translation_m, 
     assert inside_covariance(result, -clock_s)
 
 
+@pytest.mark.parametrize("rotation_deg", [[1.0, -5.0, 0.3], [-3.0, 3.0, 0.0]])
+def test_a_rig_off_by_degrees_is_searched_for(body, scan, rotation_deg):
+    """Farther than edges are looked for. Said, so that the rig gets calibrated again."""
+    wrong = delayed(turned(scan, rotation_deg, (0.003, 0.004, 0)), 0.05)
+    result = align_thermal(wrong, body, walk(), RECIPE)
+    rotation, _ = errors(result, T_THERMAL_DEPTH)
+    assert result.changed
+    assert result.converged
+    assert "calibrate it again" in result.messages[0]
+    assert rotation < 0.1
+    assert abs(result.time_offset_s + 0.05) < 0.01
+    assert inside_covariance(result, -0.05)
+
+
 def test_right_rig_is_left_alone(body, scan):
     result = align_thermal(scan, body, walk(), RECIPE)
     assert not result.changed

@@ -26,7 +26,16 @@ from numpy.typing import NDArray
 
 from .errors import ScanError
 from .geometry import interpolate_trajectory, invert, se3_exp, se3_log
-from .outlines import MIN_POINTS, Contrast, OutlineView, measure_outline, reach_px, read_outlines, tukey
+from .outlines import (
+    MIN_POINTS,
+    Contrast,
+    OutlineView,
+    measure_outline,
+    reach_px,
+    read_outlines,
+    search_shift,
+    tukey,
+)
 from .recipe import Recipe
 from .types import Camera, Float, Scan, Stream, SurfaceMesh, Trajectory
 
@@ -100,10 +109,25 @@ def align_thermal(
     outlines, contrast = read_outlines(scan, mesh, frames.tolist(), T_world_thermal, report)
     if len(outlines) < MIN_VIEWS:
         return _unchanged(start, f"fewer than {MIN_VIEWS} thermal views show an outline that could be used")
-    if contrast is None:
+    begin = start
+    if contrast is None:  # nothing where it should be: perhaps the rig is off by degrees
+        shift = search_shift(camera, outlines, invert(T_world_thermal))
+        if shift is not None:
+            rotation = shift[::-1] / camera.focal_px * [-1, 1]
+            begin = start.moved(np.concatenate([rotation, np.zeros(6)]))
+            T_world_thermal = T_world_depth @ invert(begin.T_thermal_depth)
+            outlines, contrast = read_outlines(scan, mesh, frames.tolist(), T_world_thermal, report)
+    if contrast is None or len(outlines) < MIN_VIEWS:
         return _unchanged(start, "the outline does not stand out from the background in the thermal images")
     times_s = stream.times_s[frames[[v.row for v in outlines]]]
-    return _refine(_Views(camera, trajectory, outlines, times_s, contrast), start)
+    result = _refine(_Views(camera, trajectory, outlines, times_s, contrast), begin)
+    if begin is start:
+        return result
+    if not result.converged:
+        return _unchanged(start, "the outline was found far from where the rig says, but did not come to rest there")
+    found = _State(result.T_thermal_depth, result.time_offset_s)
+    text = f"{_described(found.distance(start)[:7])}: calibrate it again"
+    return replace(result, changed=True, messages=(text, *result.messages[1:]))
 
 
 # ---------------------------------------------------------------- the measurements
@@ -202,8 +226,7 @@ def _refine(views: _Views, start: _State) -> AlignmentResult:
     chi2 = float(change @ np.linalg.solve(cov, change))
     supported = chi2 > SUPPORT_CHI2 and after < before
     converged = solved.rest < AT_REST
-    angle, shift = np.degrees(np.linalg.norm(change[:3])), 1e3 * np.linalg.norm(change[3:6])
-    found = f"rig {angle:.2f}° and {shift:.1f} mm, clock {1e3 * change[6]:+.1f} ms from the scan's own"
+    found = _described(change)
     result = AlignmentResult(
         solved.state.T_thermal_depth,
         solved.state.time_offset_s,
@@ -231,6 +254,12 @@ def _refine(views: _Views, start: _State) -> AlignmentResult:
         changed=False,
         messages=(f"the rig is left alone: a change ({found}) {why}",),
     )
+
+
+def _described(change: Float) -> str:
+    """The seven numbers of a change for people."""
+    angle, shift = np.degrees(np.linalg.norm(change[:3])), 1e3 * np.linalg.norm(change[3:6])
+    return f"rig {angle:.2f}° and {shift:.1f} mm, clock {1e3 * change[6]:+.1f} ms from the scan's own"
 
 
 def _solve(views: _Views, start: _State) -> _Solved | None:

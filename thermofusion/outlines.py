@@ -21,6 +21,9 @@ MIN_STEP_NETD = 8.0  # an outline whose step is smaller than this many NETD show
 MIN_STEP_SHARE = 0.4  # of the usual step: weaker ones are other things (hair, clothes, a warm background)
 CONTRAST_REACH_DEG = 1.6
 MIN_REACH_PX = 3.0
+SEARCH_PX = 4  # step of the search for a rig that is far off, and how far it reaches
+SEARCH_REACH_DEG = 7.0
+SEARCH_CLEAR = 4.0  # times the score of a shift taken at random
 MIN_SCALE_PX = 0.15
 TUKEY = 4.685
 
@@ -103,6 +106,47 @@ def _contrast(camera: Camera, views: Sequence[OutlineView], T_thermal_world: Flo
     if len(found) < MIN_POINTS or abs(np.median(found)) < MIN_STEP_NETD * noise:
         return None
     return Contrast(float(np.sign(np.median(found))), float(abs(np.median(found))))
+
+
+def search_shift(camera: Camera, views: Sequence[OutlineView], T_thermal_world: Float) -> Float | None:
+    """(2,) px by which all images are shifted against the model's outlines, or None if no shift stands out.
+
+    For a rig that is off by more than edges are looked for: a wrong direction of the camera shifts every view alike.
+    Every shift of a coarse grid is judged by how much the image differs across the shifted outline, in all views.
+    """
+    total: Float | None = None
+    for view in views:
+        coarse = view.smooth[::SEARCH_PX, ::SEARCH_PX]
+        outline = project_contour(camera, T_thermal_world[view.row], view.contour)
+        known = np.isfinite(outline.uv_px).all(axis=1) & np.isfinite(outline.normal_px).all(axis=1)
+        uv, out = outline.uv_px[known] / SEARCH_PX, 2.0 * outline.normal_px[known]
+        reach = int(np.radians(SEARCH_REACH_DEG) * camera.focal_px / SEARCH_PX)
+        step = _shifted(coarse, uv - out, reach) - _shifted(coarse, uv + out, reach)
+        seen = np.isfinite(step).sum(axis=1)
+        with np.errstate(invalid="ignore"):
+            score = np.nansum(step, axis=1) / np.sqrt(np.maximum(seen, 1)) / np.nanstd(coarse)
+        total = score if total is None else total + score
+    if total is None or not np.isfinite(total).all():
+        return None
+    side = 2 * reach + 1
+    strength = np.abs(total)
+    best = int(np.argmax(strength))
+    shift = np.array([best % side, best // side]) - reach
+    chance = float(np.median(strength))
+    if strength[best] < SEARCH_CLEAR * chance or np.abs(shift).max() == reach:
+        return None
+    return np.asarray(shift * SEARCH_PX, np.float64)
+
+
+def _shifted(image: Float32, uv: Float, reach: int) -> Float32:
+    """(S, N) the image at points (N, 2) under all shifts up to ±reach, rows first; NaN outside."""
+    h, w = image.shape
+    padded = np.full((h + 2, w + 2), np.nan, np.float32)
+    padded[1:-1, 1:-1] = image
+    d = np.arange(-reach, reach + 1)
+    u = np.clip(np.rint(uv[:, 0]).astype(int) + d[:, None] + 1, 0, w + 1)
+    v = np.clip(np.rint(uv[:, 1]).astype(int) + d[:, None] + 1, 0, h + 1)
+    return padded[v[:, None, :], u[None, :, :]].reshape(len(d) ** 2, -1)
 
 
 def measure_outline(
