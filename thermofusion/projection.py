@@ -34,6 +34,7 @@ class SurfaceRays:
             o3d.core.Tensor(np.ascontiguousarray(mesh.vertices_m, np.float32)),
             o3d.core.Tensor(np.ascontiguousarray(mesh.triangles, np.uint32)),
         )
+        self._lifted = mesh.vertices_m + np.float32(NORMAL_OFFSET_M) * mesh.normals
         edges, self._on_boundary = _edges(mesh.triangles)
         self._edge_a, self._edge_b = np.ascontiguousarray(edges[:, 0]), np.ascontiguousarray(edges[:, 1])
 
@@ -42,10 +43,12 @@ class SurfaceRays:
 
         The first `tolerance_m` of the way do not count: a noisy surface shadows itself at grazing angles.
         """
-        start = self.mesh.vertices_m[vertices] + np.float32(NORMAL_OFFSET_M) * self.mesh.normals[vertices]
-        ray = eye_m.astype(np.float32) - start
-        rays = np.concatenate([start, ray], axis=1)
-        near = tolerance_m / max(float(np.linalg.norm(ray, axis=1).min(initial=np.inf)), tolerance_m)
+        rays = np.empty((len(vertices), 6), np.float32)
+        start, ray = rays[:, :3], rays[:, 3:]
+        np.take(self._lifted, vertices, axis=0, out=start, mode="clip")
+        np.subtract(eye_m.astype(np.float32), start, out=ray)
+        nearest = np.sqrt(np.einsum("ij,ij->i", ray, ray).min(initial=np.inf))
+        near = tolerance_m / max(float(nearest), tolerance_m)
         hit = self._scene.test_occlusions(o3d.core.Tensor(rays), tnear=near, tfar=1.0)
         return ~hit.numpy()
 
@@ -89,7 +92,7 @@ def observe(
         return observe_view(surface, camera, views.T_world_thermal[view], image, mapping, view=view)
 
     parts: list[Observations] = []
-    with ThreadPoolExecutor(max_workers=2) as pool:
+    with ThreadPoolExecutor(max_workers=3) as pool:
         for part in pool.map(one, range(len(views))):
             parts.append(part)
             if progress:
@@ -122,31 +125,33 @@ def observe_view(
     cos_limit = np.cos(np.radians(mapping.last_resort_angle_deg))
     candidates = np.flatnonzero(cos > cos_limit)
 
-    points = transform_points(invert(T_world_thermal), mesh.vertices_m[candidates])
+    points = transform_points(invert(T_world_thermal), mesh.vertices_m.take(candidates, axis=0))
     uv, _ = project(camera, points)
-    inside = _inside(uv, camera, mapping.border_px)
-    candidates, points, uv = candidates[inside], points[inside], uv[inside]
+    inside = np.flatnonzero(_inside(uv, camera, mapping.border_px))
+    candidates, points, uv = candidates.take(inside), points.take(inside, axis=0), uv.take(inside, axis=0)
 
     tolerance_m = mapping.visibility_tolerance_mm / 1000
     edge_px = _edge_distance(surface, camera, T_world_thermal, cos, tolerance_m)
-    distance = edge_px[np.rint(uv[:, 1]).astype(np.intp), np.rint(uv[:, 0]).astype(np.intp)]
-    clear = distance >= min(mapping.last_resort_silhouette_px, mapping.silhouette_px)
-    candidates, points, uv, distance = candidates[clear], points[clear], uv[clear], distance[clear]
+    pixel = np.rint(uv).astype(np.intp)
+    distance = edge_px.ravel().take(pixel[:, 1] * camera.width_px + pixel[:, 0])
+    clear = np.flatnonzero(distance >= min(mapping.last_resort_silhouette_px, mapping.silhouette_px))
+    candidates, points, uv = candidates.take(clear), points.take(clear, axis=0), uv.take(clear, axis=0)
 
     signal = sample_bilinear(radiance, uv)
-    seen = surface.visible(candidates, eye_m, tolerance_m) & np.isfinite(signal)
-    vertex, range_m = candidates[seen], np.linalg.norm(points[seen], axis=1)
-    cos_angle = cos[vertex]
+    seen = np.flatnonzero(surface.visible(candidates, eye_m, tolerance_m) & np.isfinite(signal))
+    points, uv = points.take(seen, axis=0), uv.take(seen, axis=0)
+    vertex, range_m = candidates.take(seen), np.sqrt(np.einsum("ij,ij->i", points, points))
+    cos_angle = cos.take(vertex)
     return Observations(
         vertex=vertex.astype(np.int32),
         view=np.full(len(vertex), view, np.int32),
-        radiance=signal[seen],
+        radiance=signal.take(seen),
         cos_angle=cos_angle.astype(np.float32),
         range_m=range_m.astype(np.float32),
         footprint_m2=(range_m**2 / (camera.focal_px**2 * cos_angle)).astype(np.float32),
-        u_px=uv[seen, 0].astype(np.float32),
-        v_px=uv[seen, 1].astype(np.float32),
-        edge_px=distance[seen],
+        u_px=uv[:, 0].astype(np.float32),
+        v_px=uv[:, 1].astype(np.float32),
+        edge_px=distance.take(clear).take(seen),
     )
 
 
