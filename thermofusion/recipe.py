@@ -165,7 +165,7 @@ class CrosscalSection(_Section):
     surroundings: bool = Field(True, description="the body's own radiation, reflected in folds")
     align: bool = Field(True, description="refine the rig extrinsic and the thermal clock where the data support it")
     motion: bool = Field(False, description="small rigid correction of each view (breathing, sway)")
-    max_vertices: int = Field(40_000, ge=1000, description="vertices the solver uses; all are mapped")
+    max_vertices: int = Field(20_000, ge=1000, description="vertices the solver uses; all are mapped")
 
 
 class OutputSection(_Section):
