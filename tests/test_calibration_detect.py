@@ -18,13 +18,13 @@ from thermofusion.calibration.detect_color import detect_color
 from thermofusion.calibration.detect_thermal import complete, find_shift, spot_map
 from thermofusion.calibration.dropouts import register_dropouts
 from thermofusion.calibration.picks import read_picks_csv, write_picks_csv
+from thermofusion.calibration.render import Pictures, sensor_pattern, thermal_picture
 from thermofusion.calibration.rounds import detect_thermal_set
 from thermofusion.calibration.simulate import (
     Noise,
     SimulatedRig,
     plane_depth,
     simulate_set,
-    thermal_picture,
     true_pixels,
 )
 from thermofusion.calibration.single import fit_camera
@@ -108,10 +108,11 @@ def test_heated_mask_boards_of_others():
 def test_pins_of_both_signs_are_found_to_a_fraction_of_a_pixel():
     rig = SimulatedRig()
     _, _, poses = simulate_set(rig, 0, views=4, with_depth=False)
+    look, flawless = Pictures(missing=0.15), np.zeros(rig.thermal.shape, np.float32)
     errors = []
     for i, T in enumerate(poses):
         truth = true_pixels(rig, "thermal", T)
-        spots = spot_map(thermal_picture(rig, T, i, missing=0.15))
+        spots = spot_map(thermal_picture(rig, T, i, look, flawless))
         guess = truth + np.array([9.0, -6.0])
         shift, _ = find_shift(spots, guess, 14)
         np.testing.assert_allclose(shift, [-9, 6], atol=2)
@@ -127,7 +128,10 @@ def test_pins_of_both_signs_are_found_to_a_fraction_of_a_pixel():
 def test_thermal_boards_are_found_from_the_colour_camera_alone():
     rig = SimulatedRig()
     data, _, poses = simulate_set(rig, 4, views=8, with_depth=False)
-    images = {v.name: thermal_picture(rig, T, i) for i, (v, T) in enumerate(zip(data.views, poses, strict=True))}
+    look = Pictures()
+    pattern = sensor_pattern(rig.thermal, look.thermal_pattern, np.random.default_rng(4))
+    pictures = [thermal_picture(rig, T, i, look, pattern) for i, T in enumerate(poses)]
+    images = {v.name: picture for v, picture in zip(data.views, pictures, strict=True)}
     blind = replace(
         data,
         image_size={"color": data.image_size["color"]},

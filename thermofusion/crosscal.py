@@ -34,11 +34,8 @@ FIELD_HELD = 0.7  # of the prior's sigma: a pattern of the field less certain th
 SHAPE_HELD = 0.5  # a shape less certain than half the way between the skin presets is held
 GAIN_SPAN_K = 3.0  # references must differ by this much to carry a gain
 ROWS_PER_VERTEX = 20  # bound on the system: max_vertices x this many observations
-SUPPORT_CELLS, SUPPORT_ROWS, SUPPORT_VIEWS = (
-    24,
-    25,
-    3,
-)  # across the image; the field is known in cells with so much skin
+SUPPORT_CELLS = 24  # across the image; the field is known in those that hold so many rows of so many views
+SUPPORT_ROWS, SUPPORT_VIEWS = 25, 3
 MIN_SHARED = 20  # vertices that two views must share to count as overlapping
 ERROR_RASTER = 32  # cells along each side on which the field's error is evaluated
 
@@ -231,27 +228,34 @@ def _system(
         readings=tuple(blackbodies),
         reading_groups=tuple(r.view if settings.offsets else 0 for r in blackbodies),
         contacts=tuple(contact_rows),
-        reading_places=tuple(_field_known_at(rows, r, image_size) for r in blackbodies),
+        reading_places=_known_fields(rows, blackbodies, image_size) if blackbodies else (),
     )
 
 
-def _field_known_at(rows: Observations, reading: BlackbodyReading, image_size: tuple[int, int]) -> KnownField:
-    """The place nearest to a reading at which skin was seen, so that the field is known: the reading's own, mostly."""
+def _known_fields(
+    rows: Observations, readings: Sequence[BlackbodyReading], image_size: tuple[int, int]
+) -> tuple[KnownField, ...]:
+    """For each reading the nearest place at which skin was seen, so that the field is known: its own, mostly."""
     width, height = image_size
     side = width / SUPPORT_CELLS
     across, down = SUPPORT_CELLS, int(np.ceil(height / side))
     cell = np.clip((rows.v_px / side).astype(np.int64), 0, down - 1) * across
     cell += np.clip((rows.u_px / side).astype(np.int64), 0, across - 1)
-    count = np.bincount(cell, minlength=across * down)
-    views = np.unique(cell * (int(rows.view.max(initial=0)) + 1) + rows.view) // (int(rows.view.max(initial=0)) + 1)
-    good = (count >= SUPPORT_ROWS) & (np.bincount(views, minlength=across * down) >= SUPPORT_VIEWS)
-    if not good.any():
-        return KnownField(reading.u_px, reading.v_px, np.inf)
+    n_views = int(rows.view.max(initial=0)) + 1
+    seen = np.bincount(cell * n_views + rows.view, minlength=across * down * n_views).reshape(-1, n_views)
+    good = (seen.sum(axis=1) >= SUPPORT_ROWS) & ((seen > 0).sum(axis=1) >= SUPPORT_VIEWS)
     v, u = np.divmod(np.flatnonzero(good), across)
-    du = np.clip(reading.u_px, u * side, (u + 1) * side) - reading.u_px
-    dv = np.clip(reading.v_px, v * side, (v + 1) * side) - reading.v_px
-    k = int(np.argmin(np.hypot(du, dv)))
-    return KnownField(reading.u_px + float(du[k]), reading.v_px + float(dv[k]), float(np.hypot(du[k], dv[k])) / width)
+
+    def nearest(reading: BlackbodyReading) -> KnownField:
+        if not len(u):
+            return KnownField(reading.u_px, reading.v_px, np.inf)
+        du = np.clip(reading.u_px, u * side, (u + 1) * side) - reading.u_px
+        dv = np.clip(reading.v_px, v * side, (v + 1) * side) - reading.v_px
+        distance = np.hypot(du, dv)
+        k = int(np.argmin(distance))
+        return KnownField(reading.u_px + float(du[k]), reading.v_px + float(dv[k]), float(distance[k]) / width)
+
+    return tuple(nearest(r) for r in readings)
 
 
 def _contact_rows(

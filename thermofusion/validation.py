@@ -22,7 +22,7 @@ from .maperror import MapError, map_error
 from .recipe import Recipe
 from .rundir import to_json, write_text
 from .types import Scan
-from .uncertainty import BILINEAR_VARIANCE
+from .uncertainty import BILINEAR_VARIANCE, ErrorModel
 
 if TYPE_CHECKING:
     from .pipeline import Progress, Result
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 ANGLE_BINS_DEG = ((0, 20), (20, 40), (40, 60), (60, 90))
 SAMPLE = 16_000  # vertices: statistics settle to a few percent of themselves
 MOTION_GAIN = 0.005  # share by which the left-out residual must fall before corrections of views are preferred
-DEFAULT_PSF_PX = 0.7  # of a long-wave camera whose point spread was not measured
 
 
 @dataclass(frozen=True)
@@ -159,7 +158,7 @@ def validate_result(
     notes: list[str] = []
     psf_px = scan.sensor.psf_sigma_px
     if psf_px is None:
-        psf_px = DEFAULT_PSF_PX
+        psf_px = ErrorModel.psf_sigma_px
         notes.append(f"the thermal camera's point spread is not known: {psf_px} px assumed")
     error = None
     step("half maps", 0, 1)

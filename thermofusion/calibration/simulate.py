@@ -6,7 +6,6 @@ import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -133,37 +132,6 @@ def plane_depth(rig: SimulatedRig, T_depth_board: Float, noise_m: float, seed: i
     on = (across > -m) & (across < w + m) & (down > -m) & (down < h + m) & (z > 0)
     z = np.where(on, z, np.float32(3.0)).astype(np.float32)
     return z + np.random.default_rng(seed).standard_normal(z.shape, np.float32) * np.float32(noise_m) * z**2
-
-
-def thermal_picture(
-    rig: SimulatedRig,
-    T_depth_board: Float,
-    seed: int,
-    *,
-    blur_px: float = 1.0,
-    noise: float = 5.0,
-    missing: float = 0.1,
-) -> NDArray[np.uint16]:
-    """(H, W) counts: pins of either sign on a board with a slow gradient, optical blur, pixel noise, some pins gone.
-
-    A pin reflects what stands before it: bright where that is warm, dark where it is cold, both in one picture.
-    """
-    rng, camera = np.random.default_rng(seed), rig.thermal
-    fine = 4
-    px = true_pixels(rig, "thermal", T_depth_board)
-    image: NDArray = np.zeros((camera.height_px * fine, camera.width_px * fine), np.float32)
-    across = np.sin(np.linspace(0, np.pi, rig.board.columns) + rng.uniform(0, 3))
-    contrast = rng.uniform(25, 90, len(px)) * np.sign(np.tile(across, rig.board.rows) + rng.normal(0, 0.3, len(px)))
-    contrast[rng.random(len(px)) < missing] = 0
-    step = np.linalg.norm(px[1] - px[0])
-    for (u, v), c in zip(px, contrast, strict=True):
-        center = (round(((u + 0.5) * fine - 0.5) * 16), round(((v + 0.5) * fine - 0.5) * 16))
-        cv2.circle(image, center, round(0.05 * step * fine * 16), float(c), -1, cv2.LINE_AA, 4)
-    image = cv2.GaussianBlur(image, (0, 0), blur_px * fine)
-    image = cv2.resize(image, (camera.width_px, camera.height_px), interpolation=cv2.INTER_AREA) * 2.0
-    y, x = np.mgrid[0 : camera.height_px, 0 : camera.width_px]
-    slow = 60 * ((x / camera.width_px - 0.5) ** 2 + (y / camera.height_px - 0.4) ** 2)
-    return np.round(24_200 + slow + image + rng.normal(0, noise, image.shape)).astype(np.uint16)
 
 
 def mirrored(data: CalibrationSet, camera: str) -> CalibrationSet:

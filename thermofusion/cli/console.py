@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import NoReturn
 
+from ..errors import RecipeError
 from ..rundir import to_json
 
 Progress = Callable[[str, int, int], None]
@@ -29,6 +30,19 @@ def emit(value: object, text: str, as_json: bool) -> None:
 def note(text: str) -> None:
     """A line for people, beside the result."""
     print(text, file=sys.stderr)
+
+
+def low_high(text: str | None, unit: str) -> tuple[float, float] | None:
+    """The two ends of `--range low:high`; None if it was not given. Raises RecipeError."""
+    if text is None:
+        return None
+    try:
+        low, high = (float(x) for x in text.split(":"))
+    except ValueError:
+        raise RecipeError(f"--range needs low:high in {unit}, got '{text}'") from None
+    if not low < high:
+        raise RecipeError(f"--range needs low < high, got '{text}'")
+    return low, high
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from ..errors import QualityError, RecipeError
-from .console import emit, note, progress
+from .console import emit, low_high, note, progress
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Overrides = Annotated[list[str] | None, typer.Option("--set", help="section.key=value, over the recipe; repeatable")]
@@ -94,21 +94,9 @@ def export(
     from .. import pipeline
     from ..export import export as write
 
-    limits = _range(range_)
+    limits = low_high(range_, "°C")
     mesh = pipeline.load_mesh(result, show)
     written = write(
         mesh, out or result, tuple(f.strip() for f in formats.split(",")), palette=palette, range_degC=limits
     )
     emit({"written": written}, "\n".join(f"wrote {path}" for path in written), json)
-
-
-def _range(text: str | None) -> tuple[float, float] | None:
-    if text is None:
-        return None
-    try:
-        low, high = (float(x) for x in text.split(":"))
-    except ValueError:
-        raise RecipeError(f"--range needs low:high in °C, got '{text}'") from None
-    if not low < high:
-        raise RecipeError(f"--range needs low < high, got '{text}'")
-    return low, high

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..errors import RecipeError, ScanError
-from .console import Progress, emit, note, progress
+from .console import Progress, emit, low_high, note, progress
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -63,7 +63,7 @@ def curve(
 
     if model not in ("polynomial", "planck"):
         raise RecipeError(f"there is no model '{model}'", hint="choose polynomial or planck")
-    limits = None if range_ is None else _range(range_)
+    limits = low_high(range_, "counts")
     table = read_readings(readings)
     counts, degC = reading_counts(table, _opener(raw)), np.array([r.degC for r in table])
     try:
@@ -263,16 +263,6 @@ def _box(text: str) -> Box:
     if re.fullmatch(r"\d{1,5}(,\d{1,5}){3}", text) is None:
         raise RecipeError(f"--box needs LEFT,TOP,WIDTH,HEIGHT in pixels, got '{text}'")
     return Box(*map(int, text.split(",")))
-
-
-def _range(text: str) -> tuple[float, float]:
-    try:
-        low, high = (float(x) for x in text.split(":"))
-    except ValueError:
-        raise RecipeError(f"--range needs low:high in counts, got '{text}'") from None
-    if not low < high:
-        raise RecipeError(f"--range needs low < high, got '{text}'")
-    return low, high
 
 
 def _read(frames: ThermalSource, curve: RadiometricCurve | None, step: Progress) -> Iterator[NDArray]:
