@@ -18,7 +18,6 @@ from thermofusion.calibration.detect_color import detect_color
 from thermofusion.calibration.detect_thermal import complete, find_shift, spot_map
 from thermofusion.calibration.dropouts import register_dropouts
 from thermofusion.calibration.picks import read_picks_csv, write_picks_csv
-from thermofusion.calibration.render import Pictures, sensor_pattern, thermal_picture
 from thermofusion.calibration.rounds import detect_thermal_set
 from thermofusion.calibration.simulate import (
     Noise,
@@ -27,6 +26,7 @@ from thermofusion.calibration.simulate import (
     simulate_set,
     true_pixels,
 )
+from thermofusion.calibration.simulate_pictures import Pictures, sensor_pattern, thermal_picture
 from thermofusion.calibration.single import fit_camera
 from thermofusion.calibration.views import BoardPoints, CalibrationSet, View
 from thermofusion.errors import RecipeError, ScanError

@@ -12,9 +12,9 @@ from thermofusion.calibration import calibrate, calibrate_views
 from thermofusion.calibration.cameras import intrinsics_of, to_rt
 from thermofusion.calibration.detect_color import detect_color
 from thermofusion.calibration.folder import open_folder
-from thermofusion.calibration.render import Kinect, Pictures, color_picture, depth_picture, write_folder
 from thermofusion.calibration.rounds import detect_thermal_set
 from thermofusion.calibration.simulate import SimulatedRig, board_poses, true_pixels
+from thermofusion.calibration.simulate_pictures import Kinect, Pictures, color_picture, depth_picture, write_folder
 from thermofusion.calibration.views import CalibrationSet, View
 from thermofusion.geometry import invert, rotation_angle_deg
 

@@ -24,8 +24,8 @@ import numpy as np
 
 from thermofusion.calibration import Calibration, calibrate, calibrate_views
 from thermofusion.calibration.cameras import intrinsics_of, to_rt
-from thermofusion.calibration.render import Kinect, write_folder
 from thermofusion.calibration.simulate import Noise, SimulatedRig, simulate_set, true_pixels
+from thermofusion.calibration.simulate_pictures import Kinect, write_folder
 from thermofusion.geometry import invert, rotation_angle_deg
 
 Result = tuple[dict[str, np.ndarray], dict[str, float]]
