@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from walkround import ROOM_DEGC, T_THERMAL_DEPTH, blank, ellipsoid, make_scan, repainted, walk
+from support.walkround import ROOM_DEGC, T_THERMAL_DEPTH, blank, ellipsoid, make_scan, repainted, walk
 
-from thermofusion._open3d import o3d
-from thermofusion.alignment import PRIOR_TIME_S, AlignmentResult, align_thermal
 from thermofusion.errors import ScanError
-from thermofusion.geometry import invert, pose, se3_exp, se3_log
+from thermofusion.geometry._open3d import o3d
+from thermofusion.geometry.rigid import invert, pose, se3_exp, se3_log
 from thermofusion.recipe import load_recipe
+from thermofusion.rig.align import PRIOR_TIME_S, AlignmentResult, align_thermal
 from thermofusion.scans import open_scan
 from thermofusion.types import Scan, SurfaceMesh, Trajectory
 

@@ -17,16 +17,17 @@ from contextlib import contextmanager
 import cv2
 import numpy as np
 import pytest
-import scan_maker as make
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support import scan_maker as make
 
-from thermofusion.check import verify
 from thermofusion.errors import ScanError
-from thermofusion.scans import flir, open_scan
-from thermofusion.scans.files import decode_image
-from thermofusion.scans.pnm import read_pnm, write_pnm
-from thermofusion.scans.write import write_scan
+from thermofusion.files.pnm import read_pnm, write_pnm
+from thermofusion.files.reading import decode_image
+from thermofusion.scans import open_scan
+from thermofusion.scans.check import verify
+from thermofusion.scans.native.write import write_scan
+from thermofusion.scans.thermal import flir
 
 
 @pytest.fixture(scope="session")

@@ -4,18 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic_views import BAND, L_ROOM, REFLECTED_K, make_world
+from support.synthetic_views import BAND, L_ROOM, REFLECTED_K, make_world
 from test_crosscal import EXACT, blackbodies, calibrate
 
-from thermofusion import blending
-from thermofusion.blending import blend, remove_air_path
-from thermofusion.crosscal import cross_calibrate
-from thermofusion.emissivity import Blackbody, Fresnel
-from thermofusion.radiometry import ZERO_DEGC_K, apparent_radiance, paper_chain
+from thermofusion.physics.band import ZERO_DEGC_K
+from thermofusion.physics.emissivity import Blackbody, Fresnel
+from thermofusion.physics.equation import apparent_radiance, paper_chain
 from thermofusion.recipe import RadiometrySection, load_recipe
-from thermofusion.thermometry import error_model
-from thermofusion.types import Observations, SignalCurve, ThermalSensor
-from thermofusion.uncertainty import (
+from thermofusion.temperature import blend as blending
+from thermofusion.temperature.blend import blend, remove_air_path
+from thermofusion.temperature.crosscal import cross_calibrate
+from thermofusion.temperature.solve import error_model
+from thermofusion.temperature.uncertainty import (
     BILINEAR_VARIANCE,
     AngleTables,
     ErrorModel,
@@ -23,6 +23,7 @@ from thermofusion.uncertainty import (
     observation_variance,
     silhouette_share,
 )
+from thermofusion.types import Observations, SignalCurve, ThermalSensor
 
 MODEL = Fresnel(1.33)
 

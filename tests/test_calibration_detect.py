@@ -10,25 +10,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from support.simulated_pictures import Pictures, sensor_pattern, thermal_picture
+from support.simulated_rig import Noise, SimulatedRig, plane_depth, simulate_set, true_pixels
 
 from thermofusion.calibration import Board, board_pdf, board_svg, calibrate
-from thermofusion.calibration.boards import draw_board
-from thermofusion.calibration.detect_blobs import detect_blobs
-from thermofusion.calibration.detect_color import detect_color
-from thermofusion.calibration.detect_thermal import complete, find_shift, spot_map
-from thermofusion.calibration.dropouts import register_dropouts
-from thermofusion.calibration.picks import read_picks_csv, write_picks_csv
-from thermofusion.calibration.rounds import detect_thermal_set
-from thermofusion.calibration.simulate import (
-    Noise,
-    SimulatedRig,
-    plane_depth,
-    simulate_set,
-    true_pixels,
-)
-from thermofusion.calibration.simulate_pictures import Pictures, sensor_pattern, thermal_picture
-from thermofusion.calibration.single import fit_camera
-from thermofusion.calibration.views import BoardPoints, CalibrationSet, View
+from thermofusion.calibration.board.picks import read_picks_csv, write_picks_csv
+from thermofusion.calibration.board.print import draw_board
+from thermofusion.calibration.board.views import BoardPoints, CalibrationSet, View
+from thermofusion.calibration.detect.blobs import detect_blobs
+from thermofusion.calibration.detect.color import detect_color
+from thermofusion.calibration.detect.dropouts import register_dropouts
+from thermofusion.calibration.detect.thermal import complete, find_shift, spot_map
+from thermofusion.calibration.fit.rounds import detect_thermal_set
+from thermofusion.calibration.fit.single import fit_camera
 from thermofusion.errors import RecipeError, ScanError
 
 DATA = Path(__file__).parent / "data"

@@ -7,14 +7,14 @@ import json
 import cv2
 import numpy as np
 import pytest
+from support.simulated_disparity import NONE, disparity_image, true_parameters
+from support.simulated_rig import SimulatedRig, simulate_set
 
 from thermofusion.calibration import calibrate, rig_document
-from thermofusion.calibration.cameras import to_rt
-from thermofusion.calibration.depth_model import DisparityDepth
+from thermofusion.calibration.board.picks import write_picks_csv
+from thermofusion.calibration.fit.cameras import to_rt
+from thermofusion.calibration.fit.depth_model import DisparityDepth
 from thermofusion.calibration.folder import open_folder
-from thermofusion.calibration.picks import write_picks_csv
-from thermofusion.calibration.simulate import SimulatedRig, simulate_set
-from thermofusion.calibration.simulate_disparity import NONE, disparity_image, true_parameters
 from thermofusion.errors import ScanError
 
 VIEWS = 14

@@ -8,10 +8,12 @@ import cv2
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from support.simulated_rig import Noise, SimulatedRig, mirrored, simulate_set, true_pixels
 
-from thermofusion.calibration.board import Board
-from thermofusion.calibration.bundle import Options, Problem
-from thermofusion.calibration.cameras import (
+from thermofusion.calibration.board.board import Board
+from thermofusion.calibration.board.views import BoardPoints, CalibrationSet, View
+from thermofusion.calibration.fit.bundle import Options, Problem
+from thermofusion.calibration.fit.cameras import (
     from_rt,
     intrinsics_of,
     left_jacobians,
@@ -19,17 +21,16 @@ from thermofusion.calibration.cameras import (
     rotations,
     to_rt,
 )
-from thermofusion.calibration.coverage import advice, coverage
-from thermofusion.calibration.depth_model import DisparityDepth, MetricDepth
+from thermofusion.calibration.fit.coverage import advice, coverage
+from thermofusion.calibration.fit.depth_model import DisparityDepth
+from thermofusion.calibration.fit.rig import calibrate_views, predict_px
+from thermofusion.calibration.fit.single import fit_camera
+from thermofusion.calibration.fit.solver import solve
 from thermofusion.calibration.report import report_html
-from thermofusion.calibration.rig import calibrate_views, predict_px
 from thermofusion.calibration.rig_file import read_rig, rig_document, write_rig
-from thermofusion.calibration.simulate import Noise, SimulatedRig, mirrored, simulate_set, true_pixels
-from thermofusion.calibration.single import fit_camera
-from thermofusion.calibration.solver import solve
-from thermofusion.calibration.views import BoardPoints, CalibrationSet, View
 from thermofusion.errors import ScanError
-from thermofusion.geometry import invert, rotation_angle_deg, se3_exp
+from thermofusion.geometry.rigid import invert, rotation_angle_deg, se3_exp
+from thermofusion.scans.native.depth_correction import MetricDepth
 
 
 @pytest.fixture(scope="module")
@@ -75,8 +76,9 @@ def test_left_jacobian_of_rotations():
 
 @pytest.mark.parametrize("model", [MetricDepth((640, 480)), DisparityDepth((640, 480))])
 def test_the_sparse_jacobian_of_the_bundle_is_the_derivative(rig, model):
-    from thermofusion.calibration.depth_samples import sample_board
-    from thermofusion.calibration.simulate import plane_depth
+    from support.simulated_rig import plane_depth
+
+    from thermofusion.calibration.detect.depth_samples import sample_board
 
     data, _, poses = simulate_set(rig, 0, views=3, with_depth=False)
     views = []

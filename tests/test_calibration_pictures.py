@@ -7,16 +7,16 @@ from functools import partial
 
 import numpy as np
 import pytest
+from support.simulated_pictures import Kinect, Pictures, color_picture, depth_picture, write_folder
+from support.simulated_rig import SimulatedRig, board_poses, true_pixels
 
 from thermofusion.calibration import calibrate, calibrate_views
-from thermofusion.calibration.cameras import intrinsics_of, to_rt
-from thermofusion.calibration.detect_color import detect_color
+from thermofusion.calibration.board.views import CalibrationSet, View
+from thermofusion.calibration.detect.color import detect_color
+from thermofusion.calibration.fit.cameras import intrinsics_of, to_rt
+from thermofusion.calibration.fit.rounds import detect_thermal_set
 from thermofusion.calibration.folder import open_folder
-from thermofusion.calibration.rounds import detect_thermal_set
-from thermofusion.calibration.simulate import SimulatedRig, board_poses, true_pixels
-from thermofusion.calibration.simulate_pictures import Kinect, Pictures, color_picture, depth_picture, write_folder
-from thermofusion.calibration.views import CalibrationSet, View
-from thermofusion.geometry import invert, rotation_angle_deg
+from thermofusion.geometry.rigid import invert, rotation_angle_deg
 
 
 @pytest.fixture(scope="module")

@@ -5,19 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.io
-from averaged_frames import decode
 from scipy.special import ndtr
+from support.averaged_frames import decode
+from support.simulated_rig import SimulatedRig
 
-from thermofusion.calibration.noise import allan_deviation, edge_spread, still_noise
-from thermofusion.calibration.radiometric import (
-    check_monotone,
-    evaluate,
-    fit_field,
-    fit_planck,
-    fit_polynomial,
-)
-from thermofusion.calibration.simulate import SimulatedRig
-from thermofusion.calibration.timeoffset import estimate_time_offset, nearest_centroid, warm_centroid
+from thermofusion.calibration.thermal.noise import allan_deviation, edge_spread, still_noise
+from thermofusion.calibration.thermal.radiometric import check_monotone, evaluate, fit_field, fit_planck, fit_polynomial
+from thermofusion.calibration.thermal.timeoffset import estimate_time_offset, nearest_centroid, warm_centroid
 from thermofusion.errors import ScanError
 
 # The curve of the paper's camera, digits as stored by its authors.

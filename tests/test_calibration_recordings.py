@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from thermofusion.calibration import calibrate, calibrate_views, held_out_px, predict_px
-from thermofusion.calibration.picks import interpolated
+from thermofusion.calibration.board.picks import interpolated
 
 CONFIG = {
     "board": {"kind": "pins", "columns": 9, "rows": 9, "spacing_m": 0.04},  # the authors' assumption, twice too small

@@ -11,9 +11,9 @@ import pytest
 
 from thermofusion.cli import main
 from thermofusion.export import read_mesh, read_trajectory
+from thermofusion.files.shipped import data_dir
 from thermofusion.recipe import Recipe
-from thermofusion.resources import data_dir
-from thermofusion.rundir import load_artifact
+from thermofusion.results.artifacts import load_artifact
 
 
 def call(capsys, *arguments):
@@ -56,7 +56,7 @@ def test_the_demo_finds_the_true_temperatures(demo):
 
 
 def _to_truth(out):
-    from thermofusion.geometry import rigid_alignment
+    from thermofusion.geometry.rigid import rigid_alignment
 
     estimated, true = (read_trajectory(p) for p in (out / "trajectory.txt", data_dir() / "demo/truth/trajectory.txt"))
     i = np.searchsorted(true.times_s, estimated.times_s - 1e-4)
@@ -158,7 +158,7 @@ def test_a_scan_without_thermal_frames_becomes_a_mesh_without_temperatures(tmp_p
     from dataclasses import replace
 
     import thermofusion as tf
-    from thermofusion.scans.write import excerpt, write_scan
+    from thermofusion.scans.native.write import excerpt, write_scan
 
     scan = excerpt(tf.open_scan(data_dir() / "demo"), depth=slice(0, 6), color=slice(0, 2), thermal=slice(0, 0))
     scan = replace(scan, thermal=None, references=())

@@ -10,17 +10,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import scan_maker as make
 import scipy.io
 from scipy.special import ndtr
+from support import scan_maker as make
+from support.simulated_rig import SimulatedRig, simulate_set
 
-from thermofusion.calibration.blackbody import read_curve, read_field, write_field
-from thermofusion.calibration.picks import write_picks_csv
-from thermofusion.calibration.radiometric import PixelField, evaluate
-from thermofusion.calibration.simulate import SimulatedRig, simulate_set
+from thermofusion.calibration.board.picks import write_picks_csv
+from thermofusion.calibration.thermal.blackbody import read_curve, read_field, write_field
+from thermofusion.calibration.thermal.radiometric import PixelField, evaluate
 from thermofusion.cli import main
 from thermofusion.scans import open_scan, with_rig
-from thermofusion.scans.write import write_scan
+from thermofusion.scans.native.write import write_scan
 from thermofusion.types import SignalCurve, ThermalSensor
 
 PLANCK = (366_545.0, 1428.0, 1.0, -342.0)

@@ -7,10 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from result_maker import result, sphere
+from support.result_maker import result, sphere
 
 from thermofusion.cli import main
-from thermofusion.compare import (
+from thermofusion.errors import RecipeError, ScanError
+from thermofusion.export import write_ply
+from thermofusion.geometry.rigid import rotation_angle_deg, se3_exp, transform_points
+from thermofusion.judge.compare import (
     Agreement,
     bland_altman_svg,
     compare,
@@ -18,11 +21,8 @@ from thermofusion.compare import (
     compare_meshes,
     load_temperatures,
 )
-from thermofusion.errors import RecipeError, ScanError
-from thermofusion.export import write_ply
-from thermofusion.geometry import rotation_angle_deg, se3_exp, transform_points
-from thermofusion.readings import read_contacts
-from thermofusion.registration import mirrored, register
+from thermofusion.judge.contacts import read_contacts
+from thermofusion.judge.register import mirrored, register
 from thermofusion.types import SurfaceMesh, ThermalMesh
 
 
@@ -35,7 +35,7 @@ def lumpy(rings=60, around=100) -> SurfaceMesh:
     bump = lambda c, r, h: h * np.exp(-((p - c) ** 2).sum(1) / r**2)  # noqa: E731
     grow = bump([0, -0.11, 0.15], 0.05, 0.03) + bump([0.13, 0, 0.1], 0.06, 0.03) + bump([-0.1, 0.05, -0.12], 0.07, 0.02)
     vertices = (p + grow[:, None] * out).astype(np.float32)
-    from thermofusion.meshing import mesh_normals
+    from thermofusion.geometry.mesh import mesh_normals
 
     return SurfaceMesh(vertices, s.triangles, mesh_normals(vertices, s.triangles))
 

@@ -4,17 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic_views import BAND, HEIGHT, L_ROOM, REFLECTED_K, WIDTH, make_world, vignetting_K, with_view_order
+from support.synthetic_views import BAND, HEIGHT, L_ROOM, REFLECTED_K, WIDTH, make_world, vignetting_K, with_view_order
 
-from thermofusion.blending import blend
-from thermofusion.crosscal import cross_calibrate
-from thermofusion.emissivity import Fresnel, shape_direction, water
 from thermofusion.errors import ScanError
-from thermofusion.imagefield import ImageField
-from thermofusion.radiometry import ZERO_DEGC_K
+from thermofusion.mapping.references import BlackbodyReading, ContactReading, read_blackbody
+from thermofusion.physics.band import ZERO_DEGC_K
+from thermofusion.physics.emissivity import Fresnel, shape_direction, water
 from thermofusion.recipe import CrosscalSection
-from thermofusion.references import BlackbodyReading, ContactReading, read_blackbody
-from thermofusion.uncertainty import ErrorModel
+from thermofusion.temperature.blend import blend
+from thermofusion.temperature.crosscal import cross_calibrate
+from thermofusion.temperature.field import ImageField
+from thermofusion.temperature.uncertainty import ErrorModel
 
 SKIN = {"dielectric": Fresnel(1.33), "non-dielectric": Fresnel(1.33, 0.25), "water": water(BAND)}
 EXACT = ErrorModel(0.05, sigma_normal_deg=0.5, sigma_registration_px=0.0)

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermofusion.depthfilter import DepthFrames, DepthUndistorter, filter_depth
-from thermofusion.geometry import pixel_rays
+from thermofusion.depth.filter import DepthFrames, DepthUndistorter, filter_depth
+from thermofusion.geometry.camera import pixel_rays
 from thermofusion.recipe import InputSection
 from thermofusion.types import Camera, Rig, Scan, Stream
 

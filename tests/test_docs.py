@@ -11,8 +11,8 @@ from conftest import ROOT
 from typer.main import get_command
 
 from thermofusion.cli import app
+from thermofusion.files.shipped import data_dir
 from thermofusion.recipe import Recipe, key_reference, load_recipe
-from thermofusion.resources import data_dir
 
 PROSE = ("as", "at", "implements", "is", "reads", "writes")  # words that may follow the name in a sentence
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]

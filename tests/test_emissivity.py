@@ -5,7 +5,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from thermofusion.emissivity import (
+from thermofusion.errors import RecipeError
+from thermofusion.files.shipped import data_dir
+from thermofusion.physics.band import Band
+from thermofusion.physics.emissivity import (
     AngleTable,
     Blackbody,
     Cosine,
@@ -19,10 +22,7 @@ from thermofusion.emissivity import (
     shape_direction,
     water,
 )
-from thermofusion.errors import RecipeError
-from thermofusion.radiometry import Band
 from thermofusion.recipe import EmissivitySection
-from thermofusion.resources import data_dir
 
 ANGLES = [0, 10, 20, 30, 40, 50, 60, 70, 80, 85, 89]
 GOLDEN = {

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from result_maker import result, sphere
 from scipy.spatial.transform import Rotation
+from support.result_maker import result, sphere
 
 from thermofusion.errors import RecipeError, ResourceError, ScanError, ThermofusionError
 from thermofusion.export import (
@@ -35,9 +35,9 @@ from thermofusion.export import (
     write_vtp,
 )
 from thermofusion.export.columns import COLUMNS, vertex_normals
-from thermofusion.export.files import write_whole
-from thermofusion.geometry import pose
-from thermofusion.palettes import apply, color_range, srgb_to_linear
+from thermofusion.export.palettes import apply, color_range, srgb_to_linear
+from thermofusion.files.whole import write_whole
+from thermofusion.geometry.rigid import pose
 from thermofusion.types import SurfaceMesh, ThermalMesh, Trajectory, VertexFlag
 
 JS = Path(__file__).parent / "js"
@@ -305,7 +305,7 @@ def test_reads_a_foreign_ply(tmp_path):
 
 
 def test_open3d_reads_ply(tmp_path):
-    from thermofusion._open3d import o3d
+    from thermofusion.geometry._open3d import o3d
 
     mesh = result()
     read = o3d.t.io.read_triangle_mesh(str(write_ply(tmp_path / "m.ply", mesh)))

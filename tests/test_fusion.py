@@ -8,13 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermofusion import fusion, meshing
-from thermofusion.depthfilter import DepthFrames
+from thermofusion.depth.filter import DepthFrames
 from thermofusion.errors import ResourceError, ScanError
-from thermofusion.fusion import FusionResult, depth_poses, fuse_surface, window_normals
-from thermofusion.geometry import pixel_rays
+from thermofusion.geometry import mesh as meshing
+from thermofusion.geometry.camera import pixel_rays
+from thermofusion.geometry.normals import window_normals
 from thermofusion.recipe import load_recipe
-from thermofusion.tsdf import Frames, depth_noise, integrate_frames, plan_grid, survey_depth
+from thermofusion.surface import surface as fusion
+from thermofusion.surface.surface import FusionResult, depth_poses, fuse_surface
+from thermofusion.surface.tsdf import Frames, depth_noise, integrate_frames, plan_grid, survey_depth
 from thermofusion.types import Camera, Rig, Scan, Stream, Trajectory
 
 CAMERA = Camera(240, 180, np.array([[230.0, 0, 121.3], [0, 233.0, 88.2], [0, 0, 1]]))
@@ -392,7 +394,7 @@ def test_window_normals_of_two_near_surfaces_do_not_mix() -> None:
 
 def test_torso_recording_meets_its_bars(shared_data) -> None:
     """Every third frame of the simulated torso, given poses, against its true surface."""
-    from thermofusion._open3d import o3d
+    from thermofusion.geometry._open3d import o3d
     from thermofusion.scans import open_scan
 
     folder = shared_data("torso-dev")

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.linalg import expm
 
-from thermofusion import geometry as g
+from thermofusion.geometry import rigid as g
 from thermofusion.types import Camera, Trajectory, check_rigid
 
 twists = arrays(np.float64, 6, elements=st.floats(-1.5, 1.5, allow_subnormal=False))

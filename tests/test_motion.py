@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from walkround import blank, ellipsoid, make_scan, walk
+from support.walkround import blank, ellipsoid, make_scan, walk
 
-from thermofusion.geometry import invert, se3_exp, transform_points
-from thermofusion.motion import view_corrections
-from thermofusion.scans.pairing import thermal_views
+from thermofusion.geometry.rigid import invert, se3_exp, transform_points
+from thermofusion.mapping.motion import view_corrections
+from thermofusion.mapping.views import thermal_views
 from thermofusion.types import Scan, SurfaceMesh
 
 

@@ -10,13 +10,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermofusion.emissivity import Fresnel
 from thermofusion.errors import RecipeError, ScanError
 from thermofusion.paper import cylinder, reproduce, results, steps
 from thermofusion.paper.cylinder import BAND, ROOM_DEGC, ROWS, SHAPE, Profile, Uniformity, fit_outline
-from thermofusion.paper.figure import Axis, Band, Line, Picture, Plot, Points, Polar, csv_text, page
 from thermofusion.paper.report import Number, PaperReport, Writer
 from thermofusion.paper.sideview import ByAngle, Compared
+from thermofusion.physics.emissivity import Fresnel
+from thermofusion.report.plot import Axis, Band, Line, Picture, Plot, Points, Polar, csv_text, page
 from thermofusion.types import Observations
 
 SVG = "{http://www.w3.org/2000/svg}"

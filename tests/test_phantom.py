@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
-from thermofusion.emissivity import Fresnel, model_from_recipe
 from thermofusion.errors import RecipeError, ScanError
-from thermofusion.geometry import interpolate_trajectory, rotation_angle_deg, transform_points
+from thermofusion.files.tum import read_trajectory
+from thermofusion.geometry.rigid import interpolate_trajectory, rotation_angle_deg, transform_points
 from thermofusion.phantom import Studio, build_phantom, load_scene, scene_from_mapping, shipped_scenes, simulate
 from thermofusion.phantom.depth_cameras import depth_camera, measure_depth
 from thermofusion.phantom.physics import Band, fresnel_emissivity
@@ -21,11 +21,11 @@ from thermofusion.phantom.render import image_rays
 from thermofusion.phantom.scene import DepthConfig, DriftConfig, ShapeConfig, ThermalConfig
 from thermofusion.phantom.shapes import build_shape
 from thermofusion.phantom.thermal_cameras import counts_to_degC, draw_drift, expose, thermal_camera
+from thermofusion.physics.band import Band as SolverBand
+from thermofusion.physics.emissivity import Fresnel, model_from_recipe
 from thermofusion.pipeline import fuse
-from thermofusion.radiometry import Band as SolverBand
 from thermofusion.recipe import load_recipe
 from thermofusion.scans import open_scan
-from thermofusion.scans.native import read_tum_trajectory
 
 SMALL = {
     "name": "small",
@@ -300,11 +300,11 @@ def test_scan_opens_and_says_what_it_should(small):
 
 def test_depth_frames_lie_on_the_true_surface(small):
     """Back-projected through the reader with the true poses: within the Kinect's noise, breathing and sway included."""
-    from thermofusion._open3d import o3d
+    from thermofusion.geometry._open3d import o3d
 
     _, root = small
     scan, truth = open_scan(root), np.load(root / "truth" / "surface.npz")
-    trajectory = read_tum_trajectory(root / "truth" / "trajectory.txt")
+    trajectory = read_trajectory(root / "truth" / "trajectory.txt")
     surface = o3d.t.geometry.RaycastingScene()
     surface.add_triangles(o3d.core.Tensor(truth["vertices_m"]), o3d.core.Tensor(truth["triangles"].astype(np.uint32)))
     for i in (0, 11, 23):
@@ -335,7 +335,7 @@ def test_truth_projects_to_the_images_through_the_solvers_forward_model(tmp_path
     band = SolverBand(*scan.sensor.band_um)
     pose, _ = interpolate_trajectory(scan.trajectory, scan.thermal.times_s)
     vertices, normals = truth["vertices_m"].astype(np.float64), phantom.mesh.normals
-    from thermofusion._open3d import o3d
+    from thermofusion.geometry._open3d import o3d
 
     caster = o3d.t.geometry.RaycastingScene()
     caster.add_triangles(o3d.core.Tensor(truth["vertices_m"]), o3d.core.Tensor(truth["triangles"].astype(np.uint32)))

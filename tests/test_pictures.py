@@ -7,14 +7,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from result_maker import result, sphere
+from support.result_maker import result, sphere
 
-from thermofusion import lettering, palettes
 from thermofusion.errors import RecipeError
-from thermofusion.export import axes_of
-from thermofusion.pictures import Scale as ColorScale
-from thermofusion.pictures import cast_mesh, paint, render_scalar, render_views, write_png, write_views
-from thermofusion.raycasts import MARGIN, VIEWS, cast_views
+from thermofusion.export import axes_of, palettes
+from thermofusion.report import lettering
+from thermofusion.report.casts import MARGIN, VIEWS, cast_views
+from thermofusion.report.pictures import Scale as ColorScale
+from thermofusion.report.pictures import cast_mesh, paint, render_scalar, render_views, write_png, write_views
 from thermofusion.types import ThermalMesh
 
 INFERNO = ColorScale("inferno", 27.0, 33.0, "°C", "")

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermofusion._open3d import o3d
-from thermofusion.geometry import invert, pixel_rays, pose, project, transform_points
-from thermofusion.projection import SurfaceRays, clear_of_silhouettes, observe_view, sample_bilinear
+from thermofusion.geometry._open3d import o3d
+from thermofusion.geometry.camera import pixel_rays, project
+from thermofusion.geometry.rigid import invert, pose, transform_points
+from thermofusion.mapping.observe import SurfaceRays, clear_of_silhouettes, observe_view, sample_bilinear
 from thermofusion.recipe import MappingSection
 from thermofusion.types import Camera, SurfaceMesh
 

@@ -7,18 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermofusion.emissivity import Fresnel
 from thermofusion.errors import ScanError
-from thermofusion.radiometry import (
-    ZERO_DEGC_K,
-    Band,
-    SignalConverter,
-    absolute,
-    apparent_radiance,
-    leaving_radiance,
-    normal_equivalent,
-    paper_chain,
-)
+from thermofusion.physics.band import ZERO_DEGC_K, Band
+from thermofusion.physics.emissivity import Fresnel
+from thermofusion.physics.equation import absolute, apparent_radiance, leaving_radiance, normal_equivalent, paper_chain
+from thermofusion.physics.signal import SignalConverter
 from thermofusion.types import SignalCurve, ThermalSensor
 
 BAND = Band()

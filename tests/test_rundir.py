@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 from thermofusion.errors import ResourceError
-from thermofusion.rundir import Stages, load_artifact, replacing, save_artifact, to_json, write_text
+from thermofusion.files.json import to_json
+from thermofusion.files.whole import replacing, write_text
+from thermofusion.results.artifacts import load_artifact, save_artifact
+from thermofusion.results.stages import Stages
 from thermofusion.types import SurfaceMesh, Trajectory
 
 

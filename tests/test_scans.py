@@ -9,19 +9,23 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-import scan_maker as make
 from conftest import ROOT
+from support import scan_maker as make
 
-from thermofusion.calibration.depth_model import MetricDepth
-from thermofusion.check import check_scan, missing_metadata, overlays, verify
 from thermofusion.errors import RecipeError, ScanError
-from thermofusion.geometry import backproject, pose, project, se3_exp, transform_points
-from thermofusion.radiometry import counts_to_kelvin
-from thermofusion.scans import FORMATS, apcshelf, azure, ebml, fakenect, flir, jhu, open_scan, with_rig, with_thermal
+from thermofusion.files.pnm import read_pnm, write_pnm
+from thermofusion.geometry.camera import backproject, project
+from thermofusion.geometry.rigid import pose, se3_exp, transform_points
+from thermofusion.mapping.views import NO_POSE, OUTSIDE, SHUTTER, thermal_views
+from thermofusion.physics.signal import counts_to_kelvin
+from thermofusion.scans import FORMATS, open_scan, with_rig, with_thermal
+from thermofusion.scans.check import check_scan, missing_metadata, overlays, verify
+from thermofusion.scans.formats import apcshelf, azure, ebml, fakenect, jhu
+from thermofusion.scans.native.depth_correction import MetricDepth
+from thermofusion.scans.native.write import excerpt, scan_json, write_scan
 from thermofusion.scans.overlay import edge_overlays
-from thermofusion.scans.pairing import NO_POSE, OUTSIDE, SHUTTER, pair_color, thermal_views
-from thermofusion.scans.pnm import read_pnm, write_pnm
-from thermofusion.scans.write import excerpt, scan_json, write_scan
+from thermofusion.scans.pairing import pair_color
+from thermofusion.scans.thermal import flir
 from thermofusion.types import Trajectory
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import tracking_scenes as scenes
+from support import tracking_scenes as scenes
 
-from thermofusion.depthfilter import DepthFrames
-from thermofusion.geometry import pixel_rays, transform_points
+from thermofusion.depth.filter import DepthFrames
+from thermofusion.depth.subject import SubjectFrames, behind_subject, find_floor, static_scene
+from thermofusion.geometry.camera import pixel_rays
+from thermofusion.geometry.rigid import transform_points
 from thermofusion.recipe import load_recipe
 from thermofusion.scans import open_scan
-from thermofusion.segmentation import SubjectFrames, behind_subject, find_floor, static_scene
 
 RAYS = (pixel_rays(scenes.CAMERA) / pixel_rays(scenes.CAMERA)[..., 2:]).astype(np.float32)
 WALL = scenes.box([-1.5, -1.2, 1.0], [1.5, 1.2, 1.05])

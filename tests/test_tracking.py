@@ -6,18 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import tracking_scenes as scenes
+from support import tracking_scenes as scenes
 
 from thermofusion.errors import ScanError
-from thermofusion.geometry import invert, se3_exp, transform_points
+from thermofusion.files.tum import read_trajectory
+from thermofusion.geometry.rigid import invert, se3_exp, transform_points
 from thermofusion.recipe import load_recipe
 from thermofusion.scans import open_scan
-from thermofusion.scans.native import read_tum_trajectory
-from thermofusion.tracking import track
 from thermofusion.tracking.frames import coarse_depth, local_contrast, stiffness_of
 from thermofusion.tracking.joint import solve_jointly
 from thermofusion.tracking.maps import DepthMap
 from thermofusion.tracking.registration import agreement, register
+from thermofusion.tracking.track import track
 from thermofusion.types import Rig, Stream, Trajectory
 
 RECIPE = load_recipe("torso")
@@ -253,7 +253,7 @@ def test_torso_recording(shared_data):
     d = scan.depth
     scan = replace(scan, trajectory=None, depth=Stream(d.times_s[:n], d.load, d.places[:n], d.index[:n], d.usable[:n]))
     result = track(scan, RECIPE)
-    truth = read_tum_trajectory(root / "truth" / "trajectory.txt")
+    truth = read_trajectory(root / "truth" / "trajectory.txt")
     assert result.tracked.all()
     walk = scenes.Walk(np.empty(0), truth.T_world_depth[:n])
     on_grid = Trajectory(scenes.FRAME_S * np.arange(n), result.trajectory.T_world_depth)

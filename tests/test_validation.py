@@ -7,22 +7,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic_views import BAND, HEIGHT, L_ROOM, REFLECTED_K, WIDTH, make_world, vignetting_K
+from support.synthetic_views import BAND, HEIGHT, L_ROOM, REFLECTED_K, WIDTH, make_world, vignetting_K
 
 from thermofusion.cli import main
-from thermofusion.emissivity import Fresnel
 from thermofusion.errors import RecipeError, ScanError
-from thermofusion.errorstats import Statistics, robust_rms, weighted_quantile
-from thermofusion.leftout import WELL_SEEN_COS, Bench
-from thermofusion.maperror import map_error
+from thermofusion.judge.leftout import WELL_SEEN_COS, Bench
+from thermofusion.judge.maperror import map_error
+from thermofusion.judge.validate import validate
+from thermofusion.mapping.references import BlackbodyReading
 from thermofusion.phantom import load_scene, simulate
-from thermofusion.radiometry import ZERO_DEGC_K
+from thermofusion.physics.band import ZERO_DEGC_K
+from thermofusion.physics.emissivity import Fresnel
 from thermofusion.recipe import load_recipe
-from thermofusion.references import BlackbodyReading
+from thermofusion.robust import Statistics, mad_sigma, weighted_quantile
 from thermofusion.scans import open_scan
+from thermofusion.temperature.uncertainty import BILINEAR_VARIANCE, ErrorModel
 from thermofusion.types import Camera, SurfaceMesh
-from thermofusion.uncertainty import BILINEAR_VARIANCE, ErrorModel
-from thermofusion.validation import validate
 
 NEVER = lambda stage, done, total: None  # noqa: E731
 
@@ -111,7 +111,7 @@ def test_method_without_calibration_is_predicted_too():
     world = make_world(3, drift_K=1.0)
     joint = make_bench(world, 0.05).predictions(4, NEVER)
     mean = make_bench(world, 0.05, radiometry__method='"mean"').predictions(4, NEVER)
-    assert robust_rms(mean.residual_K) > 2 * robust_rms(joint.residual_K)
+    assert mad_sigma(mean.residual_K) > 2 * mad_sigma(joint.residual_K)
 
 
 @pytest.mark.parametrize(
@@ -162,7 +162,7 @@ def test_statistics():
     assert Statistics.of(e, weight=np.array([1.0, 1.0, 0.0, 0.0])).bias_K == 0.0
     assert Statistics.of(np.zeros(0)).n == 0
     assert weighted_quantile(np.array([3.0, 1.0, 2.0]), np.ones(3), 0.5) == 2.0
-    assert robust_rms(np.random.default_rng(0).normal(size=20_000)) == pytest.approx(1.0, rel=0.03)
+    assert mad_sigma(np.random.default_rng(0).normal(size=20_000)) == pytest.approx(1.0, rel=0.03)
 
 
 @pytest.fixture(scope="module")
@@ -196,7 +196,7 @@ def test_validate_from_recording_to_report(ball, tmp_path, capsys):
     assert straight["rmse_K"] == pytest.approx(report["noise_K"], rel=0.25)  # an isothermal body: noise is all there is
     truth = np.load(ball / "truth" / "surface.npz")
     assert np.ptp(truth["temperature_degC"]) < 1e-6
-    from thermofusion.pipeline import load_mesh
+    from thermofusion.results.folder import load_mesh
 
     mesh = load_mesh(out)
     well = mesh.measured & (mesh.view_angle_deg < 60) & (mesh.observations >= 2)

@@ -10,26 +10,25 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from . import __version__
-from .check import verify
-from .errors import RecipeError, ScanError
+from .errors import ScanError
+from .progress import Progress, silent
 from .recipe import Recipe
 from .report.summary import result_report, summary
-from .rundir import StagePlan, Stages, fingerprint, load_artifact, save_artifact, to_json, write_text
-from .types import Scan, SurfaceMesh, ThermalMesh, Trajectory
+from .results.folder import Result, load_mesh, write_result
+from .results.stages import StagePlan, Stages, fingerprint
+from .scans.check import verify
+from .types import Scan, SurfaceMesh
+from .version import __version__
 
 if TYPE_CHECKING:
-    from .alignment import AlignmentResult
-    from .fusion import FusionResult
-    from .raycasts import Cast
-    from .thermometry import Seen, Temperature
-    from .tracking import TrackingResult
+    from .report.casts import Cast
+    from .surface.surface import FusionResult
+    from .tracking.track import TrackingResult
 
-Progress = Callable[[str, int, int], None]
 
 # Stage -> the recipe sections it reads. A stage also depends on all stages before it.
 SECTIONS: dict[str, tuple[str, ...]] = {
@@ -42,32 +41,12 @@ SECTIONS: dict[str, tuple[str, ...]] = {
 STAGES = tuple(SECTIONS)
 
 
-@dataclass(frozen=True, eq=False)
-class Result:
-    """What `fuse` returns: the mesh, and how it came about. Stages that were not needed or not reached are None."""
-
-    report: dict[str, Any]
-    trajectory: Trajectory
-    tracking: TrackingResult | None = None
-    surface: FusionResult | None = None
-    alignment: AlignmentResult | None = None
-    seen: Seen | None = None
-    temperature: Temperature | None = None
-
-    @property
-    def mesh(self) -> ThermalMesh:
-        """The surface with its temperatures. Raises RecipeError if the run was stopped before there were any."""
-        if self.temperature is None:
-            raise RecipeError("the run was stopped before the temperature stage", hint="run without --until")
-        return self.temperature.mesh
-
-
 def fuse(
     scan: Scan,
     recipe: Recipe,
     *,
     out: Path | str | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     redo_from: str | None = None,
     until: str | None = None,
     compare_methods: bool = False,
@@ -82,13 +61,13 @@ def fuse(
 
     Raises ScanError (unusable input), RecipeError, ResourceError. What was computed before an error stays in `out`.
     """
-    from .alignment import align_thermal
-    from .thermometry import measure, see, unmeasured
+    from .rig.align import align_thermal
+    from .temperature.solve import measure, see, unmeasured
 
     verify(scan)
     folder = None if out is None else Path(out)
     stages = _stages(scan, folder, redo_from)
-    step = progress or _silent
+    step = progress
     last = STAGES.index(until) if until else len(STAGES) - 1
 
     def run(name: str, compute: Callable[[Progress], Any]) -> Any:
@@ -128,7 +107,7 @@ def fuse(
 
 def locate(scan: Scan, recipe: Recipe, progress: Progress) -> TrackingResult:
     """Where the depth camera was: the recorded trajectory as it is, or tracked (see `tracking`)."""
-    from .tracking import recorded, track
+    from .tracking.track import recorded, track
 
     source = recipe.tracking.source
     if source == "recorded" and scan.trajectory is None:
@@ -142,8 +121,8 @@ def locate(scan: Scan, recipe: Recipe, progress: Progress) -> TrackingResult:
 
 def fuse_subject(scan: Scan, tracking: TrackingResult, recipe: Recipe, progress: Progress) -> FusionResult:
     """The subject's surface (see `fusion`). Before a standing camera the room is masked out as in tracking."""
-    from .fusion import fuse_surface
-    from .segmentation import SubjectFrames
+    from .depth.subject import SubjectFrames
+    from .surface.surface import fuse_surface
 
     frames = SubjectFrames(scan, recipe) if recipe.subject.motion == "subject" else None
     return fuse_surface(
@@ -157,39 +136,9 @@ def plan(scan: Scan, recipe: Recipe, out: Path, *, redo_from: str | None = None)
     return [stages.plan(name, _inputs(name, recipe)) for name in STAGES]
 
 
-def write_result(result: Result, recipe: Recipe, folder: Path, casts: Future[list[Cast]] | None = None) -> None:
-    """The result folder's files (docs/formats.md), each whole or not at all; `result.json` comes last.
-
-    casts : the pictures' rays, if they were cast meanwhile.
-    """
-    from .export import export, write_trajectory
-    from .pictures import write_views
-
-    write_text(folder / "recipe.resolved.toml", recipe.to_toml())
-    write_trajectory(folder / "trajectory.txt", result.trajectory)
-    if result.temperature is not None:
-        mesh, output = result.mesh, recipe.output
-        export(mesh, folder, tuple(output.formats), palette=output.palette, range_degC=output.range_degC)
-        save_artifact(folder / "result.npz", result.temperature)
-        if output.views:
-            cast = None if casts is None else casts.result()
-            write_views(mesh, folder / "views", palette=output.palette, range_degC=output.range_degC, casts=cast)
-    write_text(folder / "result.json", to_json(result.report))
-
-
-def load_mesh(folder: Path, show: str = "absolute") -> ThermalMesh:
-    """The mesh of a finished result, in one of the three output modes."""
-    path = folder / "result.npz"
-    try:
-        temperature = load_artifact(path)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as e:
-        raise ScanError(f"no finished result is here ({e})", place=path, hint="run `thermofusion run` first") from None
-    return temperature.shown(show)
-
-
 def _casting(surface: SurfaceMesh, axes: dict[str, str]) -> Future[list[Cast]]:
     from .export import axes_of
-    from .pictures import cast_surface
+    from .report.pictures import cast_surface
 
     pool = ThreadPoolExecutor(max_workers=1)
     casts = pool.submit(cast_surface, surface, axes_of(axes))
@@ -213,10 +162,6 @@ def _stages(scan: Scan, folder: Path | None, redo_from: str | None) -> Stages:
 
 def _inputs(name: str, recipe: Recipe) -> dict[str, Any]:
     return {section: getattr(recipe, section) for section in SECTIONS[name]}
-
-
-def _silent(stage: str, done: int, total: int) -> None:
-    """No progress wanted."""
 
 
 __all__ = ["STAGES", "Result", "fuse", "load_mesh", "plan", "summary", "write_result"]

@@ -17,7 +17,7 @@ import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from .errors import RecipeError
-from .resources import recipes_dir
+from .files.shipped import recipes_dir
 
 
 class _Section(BaseModel):

@@ -17,12 +17,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line sets i
 
 import numpy as np
 
-from thermofusion._open3d import o3d
-from thermofusion.geometry import invert
-from thermofusion.projection import SurfaceRays, observe
-from thermofusion.radiometry import SignalConverter
+from thermofusion.geometry._open3d import o3d
+from thermofusion.geometry.rigid import invert
+from thermofusion.mapping.observe import SurfaceRays, observe
+from thermofusion.physics.signal import SignalConverter
 from thermofusion.recipe import MappingSection
-from thermofusion.rundir import load_artifact
+from thermofusion.results.artifacts import load_artifact
 from thermofusion.scans import open_scan
 from thermofusion.types import ThermalViews
 

@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from thermofusion import geometry
+from thermofusion.files.tum import read_trajectory
+from thermofusion.geometry import rigid as geometry
 from thermofusion.recipe import load_recipe
 from thermofusion.scans import open_scan
-from thermofusion.scans.native import read_tum_trajectory
-from thermofusion.tracking import track
+from thermofusion.tracking.track import track
 from thermofusion.types import Stream, Trajectory
 
 
@@ -33,7 +33,7 @@ def main() -> None:
     o = parser.parse_args()
     scan = open_scan(o.scan)
     truth_file = o.scan / "truth" / "trajectory.txt"
-    truth = read_tum_trajectory(truth_file) if truth_file.is_file() else scan.trajectory
+    truth = read_trajectory(truth_file) if truth_file.is_file() else scan.trajectory
     scan = replace(scan, trajectory=None, depth=first(scan.depth, o.frames))
     recipe = load_recipe(o.recipe, o.overrides)
 

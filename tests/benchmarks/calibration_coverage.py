@@ -21,12 +21,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from support.simulated_pictures import Kinect, write_folder
+from support.simulated_rig import Noise, SimulatedRig, simulate_set, true_pixels
 
 from thermofusion.calibration import Calibration, calibrate, calibrate_views
-from thermofusion.calibration.cameras import intrinsics_of, to_rt
-from thermofusion.calibration.simulate import Noise, SimulatedRig, simulate_set, true_pixels
-from thermofusion.calibration.simulate_pictures import Kinect, write_folder
-from thermofusion.geometry import invert, rotation_angle_deg
+from thermofusion.calibration.fit.cameras import intrinsics_of, to_rt
+from thermofusion.geometry.rigid import invert, rotation_angle_deg
 
 Result = tuple[dict[str, np.ndarray], dict[str, float]]
 

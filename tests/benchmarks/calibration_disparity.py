@@ -10,12 +10,12 @@ from __future__ import annotations
 import sys
 
 import numpy as np
+from support.simulated_disparity import disparity_image, true_parameters
+from support.simulated_rig import SimulatedRig, simulate_set
 
-from thermofusion.calibration.cameras import to_rt
-from thermofusion.calibration.depth_model import DisparityDepth
-from thermofusion.calibration.rig import calibrate_views
-from thermofusion.calibration.simulate import SimulatedRig, simulate_set
-from thermofusion.calibration.simulate_disparity import disparity_image, true_parameters
+from thermofusion.calibration.fit.cameras import to_rt
+from thermofusion.calibration.fit.depth_model import DisparityDepth
+from thermofusion.calibration.fit.rig import calibrate_views
 
 
 def run(seed: int, views: int) -> tuple[dict[str, np.ndarray], dict[str, float]]:

@@ -5,11 +5,11 @@
 
 from __future__ import annotations
 
-from .board import Board
-from .boards import board_pdf, board_svg
+from .board.board import Board
+from .board.print import board_pdf, board_svg
 from .calibrate import Calibrated, calibrate
+from .fit.rig import Calibration, calibrate_views, held_out_px, predict_px
 from .report import report_html
-from .rig import Calibration, calibrate_views, held_out_px, predict_px
 from .rig_file import read_rig, rig_document, write_rig
 
 __all__ = [

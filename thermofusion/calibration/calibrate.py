@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 
 from ..errors import ScanError
 from ..types import Float, UInt8
-from .board import Board
-from .coverage import advice, coverage
-from .detect_blobs import detect_blobs
-from .detect_color import detect_color
-from .detect_thermal import is_saturated
+from .board.board import Board
+from .board.picks import interpolated, read_picks_csv, read_picks_mat
+from .board.views import BoardPoints, CalibrationSet, View
+from .detect.blobs import detect_blobs
+from .detect.color import detect_color
+from .detect.pictures import draw_points, to_grey
+from .detect.thermal import is_saturated
+from .fit.coverage import advice, coverage
+from .fit.rig import Calibration, calibrate_views
+from .fit.rounds import detect_thermal_set
 from .folder import CalibrationFolder, open_folder
-from .picks import interpolated, read_picks_csv, read_picks_mat
-from .pictures import draw_points, to_grey
-from .rig import Calibration, calibrate_views
-from .rounds import detect_thermal_set
-from .views import BoardPoints, CalibrationSet, View
 
 MIN_SHARE_FOUND = 0.3  # of the pictures; below this the board described is not the one in view
 MAX_INTERPOLATED = 0.3  # of picked points; more says that nobody looked at most of them

@@ -28,10 +28,10 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from ..errors import ScanError
-from ..scans.files import depth_from_raw, inside, read_image
+from ..files.reading import depth_from_raw, inside, read_image
 from ..types import Camera, Float, check_rigid
-from .board import Board
-from .thermal_source import RawLayout
+from .board.board import Board
+from .thermal.source import RawLayout
 
 FILE = "calibration.json"
 NO_DISPARITY = 2047  # a Kinect's eleven bits of 1

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..types import Float
-from .cameras import INTRINSIC_NAMES, to_rt
-from .coverage import coverage
-from .rig import Calibration
+from .fit.cameras import INTRINSIC_NAMES, to_rt
+from .fit.coverage import coverage
+from .fit.rig import Calibration
 from .rig_file import figures
 
 WIDTH, HEIGHT = 420, 300

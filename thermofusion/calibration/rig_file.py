@@ -12,10 +12,10 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from ..errors import ScanError
-from ..rundir import write_text
+from ..files.whole import write_text
 from ..types import Camera, Float, Rig, SignalCurve
-from .cameras import INTRINSIC_NAMES
-from .rig import Calibration
+from .fit.cameras import INTRINSIC_NAMES
+from .fit.rig import Calibration
 
 SCHEMA = "thermofusion-rig/1"
 EXTRINSIC_ORDER = ("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m")

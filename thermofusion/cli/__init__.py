@@ -16,8 +16,8 @@ os.environ.setdefault("MKL_NUM_THREADS", "1")
 
 import typer
 
-from .. import __version__
 from ..errors import ThermofusionError
+from ..version import __version__
 from . import calibrate, inspect, judge, paper, process, recordings, thermal
 from .console import fail
 

@@ -36,8 +36,8 @@ def calibrate(
     """Cameras and rig from pictures of a board: rig.json with covariances, and a report."""
     from ..calibration import calibrate as solve
     from ..calibration import report_html, rig_document, write_rig
-    from ..calibration.blackbody import read_curve
-    from ..rundir import write_text
+    from ..calibration.thermal.blackbody import read_curve
+    from ..files.whole import write_text
 
     day, radiometry = _day(date), None if curve is None else read_curve(curve)
     done = solve(folder, picks=picks, progress=(lambda _: None) if json else note)
@@ -83,7 +83,7 @@ def board(
 ) -> None:
     """A board to print at 100 %, with a scale bar to check the printer."""
     from ..calibration import Board, board_pdf, board_svg
-    from ..rundir import replacing
+    from ..files.whole import replacing
 
     target = Board(kind, columns, rows, spacing_mm / 1e3)  # type: ignore[arg-type]
     if out.suffix not in (".svg", ".pdf"):

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NoReturn
 
 from ..errors import RecipeError
-from ..rundir import to_json
-
-Progress = Callable[[str, int, int], None]
+from ..files.json import to_json
+from ..progress import Progress
 
 
 def fail(sentence: str, code: int, as_json: bool) -> NoReturn:

@@ -22,7 +22,7 @@ def register(app: typer.Typer) -> None:
 
 def doctor(json: Json = False) -> int:
     """Versions, libraries, memory, cameras and USB permissions: what works here."""
-    from ..doctor import examine
+    from .doctor import examine
 
     findings = examine()
     sign = {"ok": "ok     ", "warning": "warning", "problem": "PROBLEM"}
@@ -38,9 +38,9 @@ def check(
     json: Json = False,
 ) -> int:
     """Streams, sync, units, extrinsics, overlay pictures, missing metadata of a recording."""
-    from ..check import check_scan, overlays
-    from ..pictures import write_png
+    from ..report.pictures import write_png
     from ..scans import open_scan, with_rig
+    from ..scans.check import check_scan, overlays
 
     recording = open_scan(scan, format=format)
     if rig is not None:

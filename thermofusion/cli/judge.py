@@ -32,9 +32,9 @@ def validate(
     json: Json = False,
 ) -> None:
     """Leave views out and predict them: error in K by viewing angle, and the map's own expected error."""
+    from ..judge.validate import validate as judge
     from ..recipe import load_recipe
     from ..scans import open_scan
-    from ..validation import validate as judge
 
     recording, chosen = open_scan(scan, format=format), load_recipe(recipe, set_ or ())
     with progress(json) as step:
@@ -55,8 +55,8 @@ def compare(
     json: Json = False,
 ) -> None:
     """A result against another one, its mirror image, a truth, or contact readings: bias and limits of agreement."""
-    from ..compare import compare as judge
-    from ..compare import write_comparison
+    from ..judge.compare import compare as judge
+    from ..judge.compare import write_comparison
 
     found = judge(first, second, mirror=mirror, moved=registered, max_distance_m=max_distance_mm / 1e3)
     written = [] if out is None else write_comparison(found, out)

@@ -69,8 +69,8 @@ def demo(
 ) -> int:
     """The shipped scan, end to end, then where to look."""
     from .. import pipeline
+    from ..files.shipped import data_dir
     from ..recipe import load_recipe
-    from ..resources import data_dir
     from ..scans import open_scan
 
     scan = open_scan(data_dir() / "demo")

@@ -31,8 +31,8 @@ def import_(
 ) -> None:
     """Write a foreign recording in the native scan form."""
     from ..scans import open_scan, with_rig, with_thermal
-    from ..scans.flir import read_thermal_frames
-    from ..scans.write import write_scan
+    from ..scans.native.write import write_scan
+    from ..scans.thermal.flir import read_thermal_frames
 
     scan = open_scan(recording, format=format)
     if thermal is not None and rig is None:

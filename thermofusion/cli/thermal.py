@@ -15,9 +15,9 @@ from .console import Progress, emit, low_high, note, progress
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from ..calibration.blackbody import Box
-    from ..calibration.radiometric import RadiometricCurve
-    from ..calibration.thermal_source import RawLayout, ThermalSource
+    from ..calibration.thermal.blackbody import Box
+    from ..calibration.thermal.radiometric import RadiometricCurve
+    from ..calibration.thermal.source import RawLayout, ThermalSource
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Readings = Annotated[Path, typer.Argument(help="CSV: counts,degC, or file,degC[,left_px,top_px,width_px,height_px].")]
@@ -58,8 +58,8 @@ def curve(
     """Counts to °C from blackbody readings; refused where the curve would turn."""
     import numpy as np
 
-    from ..calibration.blackbody import curve_document, read_readings, reading_counts, write_curve
-    from ..calibration.radiometric import fit_planck, fit_polynomial
+    from ..calibration.thermal.blackbody import curve_document, read_readings, reading_counts, write_curve
+    from ..calibration.thermal.radiometric import fit_planck, fit_polynomial
 
     if model not in ("polynomial", "planck"):
         raise RecipeError(f"there is no model '{model}'", hint="choose polynomial or planck")
@@ -96,8 +96,8 @@ def field(
     """Vignetting and offsets of every pixel, from pictures that a uniform source fills."""
     import numpy as np
 
-    from ..calibration.blackbody import read_readings, write_field
-    from ..calibration.radiometric import fit_field
+    from ..calibration.thermal.blackbody import read_readings, write_field
+    from ..calibration.thermal.radiometric import fit_field
 
     table, opener, chosen = read_readings(readings), _opener(raw), _curve(curve)
     chosen = chosen and chosen.widened(FIELD_MARGIN)
@@ -129,8 +129,8 @@ def flatten(
     """Pictures, or a whole scan, as apparent °C with the pixel field taken off."""
     import numpy as np
 
-    from ..calibration.blackbody import read_field
-    from ..calibration.flatten import flat, flatten_scan, write_flat
+    from ..calibration.thermal.blackbody import read_field
+    from ..calibration.thermal.flatten import flat, flatten_scan, write_flat
 
     pixel_field, chosen, frames = None if field is None else read_field(field), _curve(curve), _opener(raw)(source)
     before, after = (float(np.nanstd(flat(frames, 0, f, chosen))) for f in (None, pixel_field))
@@ -153,9 +153,9 @@ def noise(
     json: Json = False,
 ) -> None:
     """NETD and drift from a recording of a scene that does not move."""
-    from ..calibration.noise import still_noise
-    from ..calibration.noise_plot import allan_svg
-    from ..rundir import write_text
+    from ..calibration.thermal.noise import still_noise
+    from ..calibration.thermal.noise_plot import allan_svg
+    from ..files.whole import write_text
 
     if out is not None and out.suffix != ".svg":
         raise RecipeError(f"the plot is written as .svg, not '{out.suffix}'", place=out)
@@ -189,7 +189,7 @@ def edge(
     json: Json = False,
 ) -> None:
     """Point spread from a straight, slightly slanted hot edge (the mean of all frames)."""
-    from ..calibration.noise import edge_spread
+    from ..calibration.thermal.noise import edge_spread
 
     part = None if box is None else _box(box)
     image, unit = _opener(raw)(source).mean_shown(_curve(curve))
@@ -212,7 +212,7 @@ def time_offset(
     json: Json = False,
 ) -> None:
     """How late the thermal clock is: time_offset_s, from something warm that moves before both cameras."""
-    from ..calibration.timeoffset import scan_time_offset
+    from ..calibration.thermal.timeoffset import scan_time_offset
     from ..scans import open_scan
 
     recording = open_scan(scan, format=format)
@@ -235,20 +235,20 @@ def time_offset(
 
 
 def _opener(raw: str | None, rate_hz: float | None = None) -> Callable[[Path], ThermalSource]:
-    from ..calibration.thermal_source import open_thermal
+    from ..calibration.thermal.source import open_thermal
 
     layout = None if raw is None else _layout(raw)
     return lambda path: open_thermal(path, raw=layout, rate_hz=rate_hz)
 
 
 def _curve(path: Path | None) -> RadiometricCurve | None:
-    from ..calibration.blackbody import read_curve
+    from ..calibration.thermal.blackbody import read_curve
 
     return None if path is None else read_curve(path)
 
 
 def _layout(text: str) -> RawLayout:
-    from ..calibration.thermal_source import RawLayout
+    from ..calibration.thermal.source import RawLayout
 
     found = re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})(,big)?(?:,skip=(\d{1,9}))?", text)
     if found is None:
@@ -258,7 +258,7 @@ def _layout(text: str) -> RawLayout:
 
 
 def _box(text: str) -> Box:
-    from ..calibration.blackbody import Box
+    from ..calibration.thermal.blackbody import Box
 
     if re.fullmatch(r"\d{1,5}(,\d{1,5}){3}", text) is None:
         raise RecipeError(f"--box needs LEFT,TOP,WIDTH,HEIGHT in pixels, got '{text}'")

@@ -10,12 +10,12 @@ from typing import Literal, get_args
 import numpy as np
 
 from ..errors import RecipeError, ResourceError, ScanError
+from ..files.tum import read_trajectory, write_trajectory
 from ..types import OutputMode, ThermalMesh, Trajectory
 from .axes import axes_of, view_axes
 from .csv import read_csv, write_csv
 from .glb import read_glb, write_glb
 from .ply import read_ply, write_ply
-from .trajectory import read_trajectory, write_trajectory
 from .vtp import read_vtp, write_vtp
 
 __all__ = [

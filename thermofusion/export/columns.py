@@ -13,9 +13,9 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import __version__
 from ..errors import ScanError
 from ..types import Float32, Int, OutputMode, SurfaceMesh, ThermalMesh, UInt8
+from ..version import __version__
 
 SCHEMA = "thermofusion-mesh/1"
 

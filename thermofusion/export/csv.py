@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ScanError
+from ..files.reading import read_whole
+from ..files.whole import write_whole
 from ..types import ThermalMesh
 from .columns import COLUMNS, TABLE_PART, check_mesh
-from .files import read_whole, write_whole
 
 POSITION, NORMAL, WORDS = ("x_m", "y_m", "z_m"), ("nx", "ny", "nz"), ("output_mode", "level")
 

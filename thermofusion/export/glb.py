@@ -17,13 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from .. import __version__
 from ..errors import ScanError
-from ..palettes import apply, color_range, srgb_to_linear, unmeasured_rgb
+from ..files.reading import read_array, read_whole
+from ..files.whole import write_whole
 from ..types import Bool, ThermalMesh
+from ..version import __version__
 from .axes import axes_of
 from .columns import COLUMNS, check_mesh, describe, result_from, surface_from, unit_normals
-from .files import read_array, read_whole, write_whole
+from .palettes import apply, color_range, srgb_to_linear, unmeasured_rgb
 
 FLOAT, UINT16, UINT32 = 5126, 5123, 5125
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963

@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ScanError
-from ..palettes import apply, color_range
+from ..files.reading import read_array, read_whole
+from ..files.whole import write_whole
 from ..types import ThermalMesh, UInt8
 from .columns import COLUMNS, PLY_PART, check_mesh, describe, result_from, surface_from
-from .files import read_array, read_whole, write_whole
+from .palettes import apply, color_range
 
 XYZ, NORMAL, RGB = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
 QUALITY = "quality"  # = scalar_temperature, for MeshLab

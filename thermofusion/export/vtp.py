@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ScanError
-from ..palettes import color_range
+from ..files.reading import read_array, read_whole
+from ..files.whole import write_whole
 from ..types import ThermalMesh
 from .columns import COLUMNS, TABLE_PART, check_mesh, describe, result_from, surface_from
-from .files import read_array, read_whole, write_whole
+from .palettes import color_range
 
 NORMALS, SKIN, DESCRIPTION = "Normals", "color_rgb", "thermofusion"
 _VTK = {"Float32": "<f4", "Float64": "<f8", "Int32": "<i4", "Int64": "<i8", "UInt8": "u1"}

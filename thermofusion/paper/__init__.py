@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import RecipeError, ScanError
+from ..progress import Progress
 from .report import FigureReport, Number, PaperReport
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from scipy.io import loadmat
 from scipy.optimize import least_squares
 
-from ..emissivity import EmissivityModel, Fresnel
 from ..errors import ScanError
-from ..radiometry import ZERO_DEGC_K, Band, normal_equivalent, paper_chain
+from ..physics.band import ZERO_DEGC_K, Band
+from ..physics.emissivity import EmissivityModel, Fresnel
+from ..physics.equation import normal_equivalent, paper_chain
 from ..types import Float
 
 SHAPE, HEADER_BYTES = (256, 320), 240

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..emissivity import (
+from ..files.shipped import data_dir
+from ..physics.band import Band
+from ..physics.emissivity import (
     COSINE_EPSILON0,
     HALE_QUERRY_1973,
     Cosine,
@@ -15,11 +17,9 @@ from ..emissivity import (
     fresnel_reflectivity,
     water,
 )
-from ..radiometry import Band
-from ..resources import data_dir
+from ..report.plot import BLUE, DASHED, GREEN, INK, ORANGE, PURPLE, Axis, Line, Plot, Points, Polar, page
+from ..report.plot import Band as Area
 from ..types import Float
-from .figure import BLUE, DASHED, GREEN, INK, ORANGE, PURPLE, Axis, Line, Plot, Points, Polar, page
-from .figure import Band as Area
 from .report import FigureReport, Number, Writer
 
 BAND = Band(7.5, 13.5)  # of the paper's camera

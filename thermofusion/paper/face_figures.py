@@ -11,16 +11,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import palettes
+from ..export import palettes
 from ..phantom import SceneConfig, load_scene, simulate
-from ..pictures import Scale, paint
 from ..pipeline import Result, fuse
-from ..raycasts import Cast, cast_views
 from ..recipe import load_recipe
+from ..report.casts import Cast, cast_views
+from ..report.pictures import Scale, paint
+from ..report.plot import BLUE, GREY, ORANGE, Axis, Bar, Line, Picture, Plot, Points, page
 from ..scans import open_scan
 from ..types import Float, Scan, UInt8
 from .emissivity_figures import SKIN
-from .figure import BLUE, GREY, ORANGE, Axis, Bar, Line, Picture, Plot, Points, page
 from .report import FigureReport, Number, Writer
 from .singleview import BackProjection, View, flat_field, smoothed, view_of
 
@@ -374,7 +374,8 @@ def _head_box(s: Sitting) -> tuple[slice, slice]:
 
 def _thermal_picture(s: Sitting, scale: Scale) -> UInt8:
     """The thermal image itself, apparent temperature, on the scale from the room to the face."""
-    from ..radiometry import ZERO_DEGC_K, SignalConverter
+    from ..physics.band import ZERO_DEGC_K
+    from ..physics.signal import SignalConverter
 
     assert s.scan.sensor is not None
     assert s.scan.thermal is not None

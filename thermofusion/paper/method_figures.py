@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from .._open3d import o3d
-from ..geometry import rigid_alignment, transform_points
+from ..geometry.rays import RayScene
+from ..geometry.rigid import rigid_alignment, transform_points
 from ..phantom import simulate
 from ..pipeline import Result, fuse
 from ..recipe import Recipe, load_recipe
 from ..scans import open_scan
-from ..thermometry import METHODS, measure
+from ..temperature.solve import METHODS, measure
 from ..types import Float, Scan, ThermalMesh, Trajectory
 from .report import FigureReport, Number, Writer
 from .scan_figures import cylinder_scene, head_scene
@@ -40,7 +40,7 @@ class TruthError:
 class Truth:
     """A phantom's `truth/`: surface, temperature, poses."""
 
-    surface: o3d.t.geometry.RaycastingScene
+    surface: RayScene
     triangles: np.ndarray
     degC: Float
     times_s: Float
@@ -52,9 +52,7 @@ class Truth:
         with np.load(scan / "truth" / "surface.npz") as z:
             v, f, T = z["vertices_m"], z["triangles"], z["temperature_degC"]
         path = np.loadtxt(scan / "truth" / "trajectory.txt", ndmin=2)
-        scene = o3d.t.geometry.RaycastingScene()
-        scene.add_triangles(o3d.core.Tensor(v.astype(np.float32)), o3d.core.Tensor(f.astype(np.uint32)))
-        return cls(scene, f, np.asarray(T, np.float64), path[:, 0], path[:, 1:4])
+        return cls(RayScene(v, f), f, np.asarray(T, np.float64), path[:, 0], path[:, 1:4])
 
     def error(self, mesh: ThermalMesh, trajectory: Trajectory) -> TruthError:
         """Compare at the nearest true points, after moving the trajectory onto the true one."""
@@ -65,11 +63,9 @@ class Truth:
             mesh.measured & (mesh.view_angle_deg < MAX_ANGLE_DEG) & (mesh.observations >= MIN_VIEWS)
         )
         points = transform_points(T_true_world, mesh.surface.vertices_m[judged].astype(np.float64)).astype(np.float32)
-        answer = self.surface.compute_closest_points(o3d.core.Tensor(points))
-        gap = np.linalg.norm(answer["points"].numpy() - points, axis=1)
-        corners, uv = self.triangles[answer["primitive_ids"].numpy()], answer["primitive_uvs"].numpy()
-        weights = np.stack([1 - uv.sum(1), uv[:, 0], uv[:, 1]], axis=1)
-        error = (mesh.temperature_degC[judged] - (self.degC[corners] * weights).sum(1))[gap < NEAR_M]
+        nearest = self.surface.closest(points)
+        expected = (self.degC[self.triangles[nearest.triangle]] * nearest.weights).sum(1)
+        error = (mesh.temperature_degC[judged] - expected)[nearest.distance < NEAR_M]
         level = float(np.median(error))
         left = error - level
         return TruthError(len(error), level, float(np.sqrt((left**2).mean())), float(np.percentile(np.abs(left), 95)))

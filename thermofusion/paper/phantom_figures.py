@@ -7,9 +7,28 @@ from pathlib import Path
 
 import numpy as np
 
-from .. import palettes
-from ..emissivity import Cosine, EmissivityModel, Fresnel
-from ..radiometry import ZERO_DEGC_K, normal_equivalent, paper_chain
+from ..export import palettes
+from ..physics.band import ZERO_DEGC_K
+from ..physics.emissivity import Cosine, EmissivityModel, Fresnel
+from ..physics.equation import normal_equivalent, paper_chain
+from ..report.plot import (
+    BLUE,
+    DASHED,
+    GREEN,
+    GREY,
+    INK,
+    ORANGE,
+    PURPLE,
+    SKY,
+    Axis,
+    Bar,
+    Line,
+    Picture,
+    Plot,
+    Points,
+    Rule,
+    page,
+)
 from ..types import Float
 from .cylinder import (
     ALUMINIUM,
@@ -27,24 +46,6 @@ from .cylinder import (
     fit_outline,
     read_frame,
     reflection_from,
-)
-from .figure import (
-    BLUE,
-    DASHED,
-    GREEN,
-    GREY,
-    INK,
-    ORANGE,
-    PURPLE,
-    SKY,
-    Axis,
-    Bar,
-    Line,
-    Picture,
-    Plot,
-    Points,
-    Rule,
-    page,
 )
 from .report import FigureReport, Number, Writer
 

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..rundir import to_json, write_text
-from .figure import csv_text
+from ..files.json import to_json
+from ..files.whole import write_text
+from ..report.plot import csv_text
 
 
 @dataclass(frozen=True)

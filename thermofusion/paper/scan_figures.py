@@ -9,16 +9,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..emissivity import Cosine, Fresnel
 from ..export.axes import axes_of
 from ..phantom import SceneConfig, load_scene, simulate
-from ..pictures import Scale, paint
+from ..physics.emissivity import Cosine, Fresnel
 from ..pipeline import Result, fuse
-from ..raycasts import cast_views
 from ..recipe import Recipe, load_recipe
-from ..scans import open_scan
-from ..types import Float, Scan
-from .figure import (
+from ..report.casts import cast_views
+from ..report.pictures import Scale, paint
+from ..report.plot import (
     AMBER,
     BLUE,
     DASHED,
@@ -37,6 +35,8 @@ from .figure import (
     Rule,
     page,
 )
+from ..scans import open_scan
+from ..types import Float, Scan
 from .report import FigureReport, Number, Writer
 from .sideview import BINS_DEG, ByAngle, Compared, compared
 

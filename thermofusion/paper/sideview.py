@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..emissivity import EmissivityModel, model_from_recipe
-from ..radiometry import ZERO_DEGC_K, Band, normal_equivalent, paper_chain
+from ..physics.band import ZERO_DEGC_K, Band
+from ..physics.emissivity import EmissivityModel, model_from_recipe
+from ..physics.equation import normal_equivalent, paper_chain
 from ..recipe import Recipe
+from ..robust import SIGMA_PER_MAD
 from ..types import Float, Observations, Scan
 from .emissivity_figures import SKIN
 
@@ -73,7 +75,7 @@ class ByAngle:
                 np.median(np.abs(x[i] - m)) if len(i) >= MIN_PAIRS else np.nan
                 for i, m in zip(inside, median, strict=True)
             ]
-            return median, 1.4826 * np.array(mad)
+            return median, SIGMA_PER_MAD * np.array(mad)
 
         both = {name: per_bin(x) for name, x in differences_K.items()}
         return cls(
@@ -96,7 +98,7 @@ def compared(
     assert result.seen is not None
     assert result.temperature is not None
     assert scan.sensor is not None
-    from ..thermometry import room_of
+    from ..temperature.solve import room_of
 
     models = given or SKIN
     rows = result.seen.observations.select(result.seen.observations.edge_px >= EDGE_PX)

@@ -11,11 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.io import loadmat
 
-from .._open3d import o3d
-from ..emissivity import EmissivityModel
 from ..export.axes import axes_of
-from ..geometry import pixel_rays
-from ..radiometry import ZERO_DEGC_K, Band, SignalConverter, normal_equivalent, paper_chain
+from ..geometry.camera import pixel_rays
+from ..geometry.rays import RayScene, rays_from
+from ..physics.band import ZERO_DEGC_K, Band
+from ..physics.emissivity import EmissivityModel
+from ..physics.equation import normal_equivalent, paper_chain
+from ..physics.signal import SignalConverter
 from ..types import Camera, Float, Float32, Scan, SignalCurve, SurfaceMesh
 
 if TYPE_CHECKING:
@@ -132,17 +134,11 @@ class BackProjection:
     @classmethod
     def of(cls, view: View) -> BackProjection:
         """Cast every pixel of the thermal camera."""
-        scene = o3d.t.geometry.RaycastingScene()
-        triangles = view.surface.triangles
-        scene.add_triangles(o3d.core.Tensor(view.surface.vertices_m), o3d.core.Tensor(triangles.astype(np.uint32)))
-        directions = pixel_rays(view.camera) @ view.T_world_thermal[:3, :3].T
-        rays = np.concatenate([np.broadcast_to(view.T_world_thermal[:3, 3], directions.shape), directions], axis=-1)
-        answer = scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))
-        hit = np.flatnonzero(np.isfinite(answer["t_hit"].numpy().ravel()))
-        uv = answer["primitive_uvs"].numpy().reshape(-1, 2)[hit]
-        corners = triangles[answer["primitive_ids"].numpy().ravel()[hit]]
-        weights = np.stack([1 - uv.sum(1), uv[:, 0], uv[:, 1]], axis=1)
-        return cls(view.camera.shape, hit, corners, weights)
+        directions = pixel_rays(view.camera).reshape(-1, 3) @ view.T_world_thermal[:3, :3].T
+        scene = RayScene(view.surface.vertices_m, view.surface.triangles)
+        found = scene.hits(rays_from(view.T_world_thermal[:3, 3], directions))
+        hit = np.flatnonzero(found.triangle >= 0)
+        return cls(view.camera.shape, hit, view.surface.triangles[found.triangle[hit]], found.weights[hit])
 
     def image(self, values: NDArray) -> Float:
         """(H, W) of per-vertex values (V,), NaN where the surface is not, or has none."""

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from .._open3d import o3d
-from ..geometry import invert
+from ..geometry._open3d import o3d
+from ..geometry.rigid import invert
 from ..types import Bool, Camera, Float, Float32
 from .physics import Band
 from .scene import RoomConfig

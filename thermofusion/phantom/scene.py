@@ -18,7 +18,7 @@ import tomli_w
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from ..errors import RecipeError
-from ..resources import recipes_dir
+from ..files.shipped import recipes_dir
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]

@@ -13,8 +13,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
-from ..geometry import pose, transform_points
-from ..resources import data_dir
+from ..files.shipped import data_dir
+from ..geometry.rigid import pose, transform_points
 from ..types import Float, Float32, Int
 from .scene import ShapeConfig
 

@@ -11,20 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from ..geometry import invert
+from ..geometry.rigid import invert
 from ..types import Bool, Camera, Float
 from .depth_cameras import DepthCamera, depth_camera, measure_depth, scaled_camera
-from .render import (
-    Caster,
-    Exchange,
-    Subject,
-    Texture,
-    exchange,
-    image_rays,
-    render_color,
-    render_depth,
-    render_thermal,
-)
+from .render import Caster, Exchange, Subject, Texture, exchange, image_rays, render_color, render_depth, render_thermal
 from .scene import SceneConfig
 from .shapes import Mesh, build_shape, vertex_normals
 from .skin import Covering, cover

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..geometry import invert, se3_exp
+from ..geometry.rigid import invert, se3_exp
 from ..types import Float
 from .scene import MotionConfig, RigConfig, WalkConfig
 

@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .. import __version__
-from ..geometry import invert, rotation_angle_deg
+from ..geometry.rigid import invert, rotation_angle_deg
 from ..recipe import Recipe
 from ..types import Scan, VertexFlag
+from ..version import __version__
 
 if TYPE_CHECKING:
-    from ..alignment import AlignmentResult
-    from ..fusion import FusionResult
     from ..pipeline import Result
-    from ..thermometry import Seen, Temperature
-    from ..tracking import TrackingResult
+    from ..rig.align import AlignmentResult
+    from ..surface.surface import FusionResult
+    from ..temperature.solve import Seen, Temperature
+    from ..tracking.track import TrackingResult
 
 PERCENTILES = (1, 5, 50, 95, 99)
 

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from ..errors import RecipeError, ScanError
 from ..types import Scan
-from .compose import with_rig, with_thermal
-from .native import is_native, read_native
+from .native.compose import with_rig, with_thermal
+from .native.read import is_native, read_native
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ def _late(module: str, function: str) -> Callable:
     """A function of a reader's module, imported when it is called: --help stays fast."""
 
     def call(path: Path) -> object:
-        return getattr(import_module(f".{module}", __name__), function)(path)
+        return getattr(import_module(module, __name__), function)(path)
 
     return call
 
@@ -47,15 +47,17 @@ def _reader(name: str, module: str, what: str) -> Format:
 # In the order of recognition: the more particular layouts first.
 FORMATS: tuple[Format, ...] = (
     Format("native", is_native, read_native, "thermofusion's own folder: scan.json + frames.csv + images"),
-    _reader("azure-mkv", "azure", "Azure Kinect recording (.mkv), without the vendor's library"),
-    _reader("realsense-bag", "realsense", "RealSense recording (.bag), through Open3D"),
-    _reader("flir", "flir", "FLIR radiometric JPEG or SEQ: thermal frames only, to be joined to a depth recording"),
-    _reader("fakenect", "fakenect", "Kinect v1 recording of libfreenect's fakenect-record (INDEX.txt)"),
-    _reader("tum", "tum", "TUM RGB-D benchmark folder (rgb.txt, depth.txt, groundtruth.txt)"),
-    _reader("apc-shelf", "apcshelf", "Princeton shelf&tote folder (cam.info.txt, bit-rotated depth)"),
-    _reader("7-scenes", "sevenscenes", "7-Scenes / 3DMatch folder (frame-NNNNNN.{color,depth,pose})"),
-    _reader("jhu", "jhu", "laboratory layout of the paper: .pgm depth and _0000.raw thermal counts"),
-    _reader("redwood", "redwood", "Redwood / Open3D folder (color/ + depth/, camera_intrinsic.json)"),
+    _reader("azure-mkv", ".formats.azure", "Azure Kinect recording (.mkv), without the vendor's library"),
+    _reader("realsense-bag", ".formats.realsense", "RealSense recording (.bag), through Open3D"),
+    _reader(
+        "flir", ".thermal.flir", "FLIR radiometric JPEG or SEQ: thermal frames only, to be joined to a depth recording"
+    ),
+    _reader("fakenect", ".formats.fakenect", "Kinect v1 recording of libfreenect's fakenect-record (INDEX.txt)"),
+    _reader("tum", ".formats.tum", "TUM RGB-D benchmark folder (rgb.txt, depth.txt, groundtruth.txt)"),
+    _reader("apc-shelf", ".formats.apcshelf", "Princeton shelf&tote folder (cam.info.txt, bit-rotated depth)"),
+    _reader("7-scenes", ".formats.sevenscenes", "7-Scenes / 3DMatch folder (frame-NNNNNN.{color,depth,pose})"),
+    _reader("jhu", ".formats.jhu", "laboratory layout of the paper: .pgm depth and _0000.raw thermal counts"),
+    _reader("redwood", ".formats.redwood", "Redwood / Open3D folder (color/ + depth/, camera_intrinsic.json)"),
 )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -11,16 +10,13 @@ from typing import Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from ..errors import ScanError
-from ..types import Camera, Float, Rig, Stream, Trajectory, check_rigid
-from .files import claimed_size, decode_image, depth_from_raw, read_bytes, read_numbers
+from ..files.reading import claimed_size, decode_image, depth_from_raw, read_bytes
+from ..types import Camera, Float, Rig, Stream
 
 Kind = Literal["depth", "color", "thermal"]
 ASSUMED_RATE_HZ = 30.0  # of recordings that carry no times
-MAX_POSITION_M = 1000.0  # a pose farther from the origin is in other units than metres
-POSE_TOLERANCE = 1e-2  # deviation of RᵀR from identity in a recorded pose
 # A Kinect v1 / PrimeSense camera whose calibration nobody recorded (Open3D's and OpenNI's default).
 NOMINAL_K = np.array([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]])
 
@@ -156,56 +152,6 @@ def make_rig(
 
 
 # ---------------------------------------------------------------- poses
-
-
-def poses_to_trajectory(times_s: NDArray, poses: NDArray, *, place: object) -> Trajectory:
-    """(N, 4, 4) T_world_depth in metres with their times; rotations are made exactly orthonormal.
-
-    Raises ScanError for a pose that is no rigid transform to `POSE_TOLERANCE`.
-    """
-    try:
-        T = np.stack([_nearest_rigid(M, f"pose {i}") for i, M in enumerate(poses)])
-        trajectory = Trajectory(times_s, T)
-    except ValueError as e:
-        raise ScanError(str(e), place=place) from None
-    if np.abs(T[:, :3, 3]).max() > MAX_POSITION_M:
-        raise ScanError(f"a pose lies more than {MAX_POSITION_M:.0f} m from the origin, expected metres", place=place)
-    return trajectory
-
-
-def _nearest_rigid(M: NDArray, name: str) -> Float:
-    """The rigid transform nearest to a rounded one: published poses are off by up to a few 1e-3."""
-    R = M[:3, :3]
-    if np.isfinite(R).all() and np.abs(R.T @ R - np.eye(3)).max() <= POSE_TOLERANCE and np.linalg.det(R) > 0:
-        U, _, Vt = np.linalg.svd(R)
-        M = np.block([[U @ Vt, M[:3, 3:]], [M[3:]]])
-    return check_rigid(M, name)
-
-
-def read_tum_trajectory(path: Path) -> Trajectory:
-    """Rows `time_s tx ty tz qx qy qz qw`, the pose T_world_depth; `#` starts a comment."""
-    rows = read_numbers(path, columns=8)
-    if len(rows) == 0:
-        raise ScanError("the trajectory has no poses", place=path, hint="delete the file to have poses estimated")
-    for number, row in enumerate(rows, 1):
-        if not np.isfinite(row).all():
-            raise ScanError(
-                "expected eight finite numbers `time_s tx ty tz qx qy qz qw`", place=f"{path}, pose {number}"
-            )
-        if abs(math.hypot(*row[4:]) - 1) > 0.02:
-            raise ScanError("the quaternion's length is not 1", place=f"{path}, pose {number}")
-    T = np.tile(np.eye(4), (len(rows), 1, 1))
-    T[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
-    T[:, :3, 3] = rows[:, 1:4]
-    return poses_to_trajectory(rows[:, 0], T, place=path)
-
-
-def tum_rows(trajectory: Trajectory) -> str:
-    """A trajectory as TUM text, digits enough to read the same numbers back."""
-    q = Rotation.from_matrix(trajectory.T_world_depth[:, :3, :3]).as_quat()
-    rows = np.column_stack([trajectory.times_s, trajectory.T_world_depth[:, :3, 3], q])
-    lines = [" ".join(repr(float(x)) for x in row) for row in rows]
-    return "\n".join(["# time_s tx ty tz qx qy qz qw: pose T_world_depth", *lines, ""])
 
 
 def frame_times(numbers: Sequence[int]) -> Float:

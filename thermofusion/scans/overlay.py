@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry import interpolate_trajectory, invert, project, transform_points
+from ..geometry.camera import project
+from ..geometry.rigid import interpolate_trajectory, invert, transform_points
 from ..types import Bool, Camera, Float, Scan, UInt8
 from .pairing import nearest_in_time
 

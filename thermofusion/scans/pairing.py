@@ -7,14 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ScanError
-from ..geometry import interpolate_trajectory, invert
-from ..types import Float, Int, Scan, ThermalViews, Trajectory, check_rigid
-
-# Why a thermal frame did not enter the result: the keys of `thermal_views`' counts.
-SHUTTER = "shutter"  # taken during, or just after, a shutter correction, or rejected by the reader
-OUTSIDE = "outside the trajectory"  # earlier than its first, or later than its last pose
-NO_POSE = "no pose"  # inside a gap of the trajectory longer than allowed: tracking was lost there
+from ..types import Float, Int, Scan
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,48 +51,3 @@ def pair_color(scan: Scan, tolerance_ms: float) -> ColorPairs:
     index[near], offset[near] = usable[nearest[near]], dt[near]
     used = len(np.unique(index[near]))
     return ColorPairs(index, offset, int(n - near.sum()), len(scan.color) - used)
-
-
-def thermal_views(
-    scan: Scan,
-    trajectory: Trajectory,
-    max_pose_gap_s: float,
-    T_thermal_depth: Float | None = None,
-    time_offset_s: float | None = None,
-) -> tuple[ThermalViews, dict[str, int]]:
-    """The thermal frames that have a pose, and how many were left out, by reason.
-
-    A thermal frame's time on the depth clock is its own time + `time_offset_s` (the sensor's by default); there the
-    trajectory is interpolated on SE(3), and T_world_thermal = T_world_depth @ T_depth_thermal.
-
-    T_thermal_depth, time_offset_s : replace the scan's own (refined ones of the cross-calibration).
-    Raises ScanError if the scan has no thermal stream, or if not one thermal frame is left.
-    """
-    stream, rig = scan.thermal, scan.rig
-    extrinsic = rig.T_thermal_depth if T_thermal_depth is None else T_thermal_depth
-    if stream is None or extrinsic is None or len(stream) == 0:
-        raise ScanError("the scan has no thermal frames", place=scan.root)
-    if time_offset_s is None:
-        time_offset_s = 0.0 if scan.sensor is None else scan.sensor.time_offset_s
-
-    times_s = stream.times_s + time_offset_s
-    T_world_depth, valid = interpolate_trajectory(trajectory, times_s, max_gap_s=max_pose_gap_s)
-    slack_s = 0.5 * float(np.median(np.diff(trajectory.times_s))) if len(trajectory) > 1 else 1e-3
-    t = trajectory.times_s
-    outside = (times_s < t[0] - slack_s) | (times_s > t[-1] + slack_s)
-    good = stream.usable & valid
-    left_out = {
-        SHUTTER: int((~stream.usable).sum()),
-        OUTSIDE: int((stream.usable & ~valid & outside).sum()),
-        NO_POSE: int((stream.usable & ~valid & ~outside).sum()),
-    }
-    if not good.any():
-        raise ScanError(
-            f"none of {len(stream)} thermal frames can be placed: "
-            + ", ".join(f"{n} {reason}" for reason, n in left_out.items() if n),
-            place=scan.root,
-            hint=f"thermal runs {times_s[0]:.3f} to {times_s[-1]:.3f} s, the trajectory {t[0]:.3f} to {t[-1]:.3f} s",
-        )
-    T_depth_thermal = invert(check_rigid(extrinsic, "T_thermal_depth"))
-    frame = np.flatnonzero(good).astype(np.int32)
-    return ThermalViews(frame, times_s[good], T_world_depth[good] @ T_depth_thermal), left_out

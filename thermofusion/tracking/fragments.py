@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry import invert
+from ..geometry.rigid import invert
 from ..types import Float, Float32
 from .frames import Frame
 from .maps import DepthMap, Intrinsics

@@ -9,11 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..depthfilter import read_ahead
-from ..geometry import project, transform_points
+from ..depth.filter import read_ahead
+from ..depth.subject import SubjectFrames
+from ..geometry.camera import project
+from ..geometry.rigid import transform_points
 from ..recipe import Recipe
 from ..scans.pairing import pair_color
-from ..segmentation import SubjectFrames
 from ..types import Float, Float32, Scan
 from .maps import DepthMap, Intrinsics
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry import invert, se3_exp
+from ..geometry.rigid import invert, se3_exp
 from ..types import Float
 from .maps import DepthMap
 from .registration import MIN_PARTNERS, find_partners, normal_equations, shape_weights

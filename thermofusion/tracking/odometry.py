@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry import invert, rotation_angle_deg, se3_exp, se3_log
+from ..geometry.rigid import invert, rotation_angle_deg, se3_exp, se3_log
 from ..recipe import Recipe, TrackingSection
 from ..types import Float
 from .fragments import Fragment, build_fragment

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry import invert, se3_exp
+from ..geometry.rigid import invert, se3_exp
+from ..robust import mad_sigma
 from ..types import Float
 from .maps import DepthMap
 
@@ -145,7 +146,7 @@ def shape_weights(rows: Rows) -> Float:
 
 def _robust(r: Float, floor: float) -> Float:
     """1/σ² times the Cauchy factor, σ from the residuals' own median."""
-    sigma = max(1.4826 * float(np.median(np.abs(r))), floor)
+    sigma = max(mad_sigma(r), floor)
     return np.asarray(1 / ((1 + (r / (2 * sigma)) ** 2) * sigma**2))
 
 

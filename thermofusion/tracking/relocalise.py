@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .._open3d import o3d
-from ..geometry import invert, pose, rotation_angle_deg
+from ..geometry._open3d import o3d
+from ..geometry.rigid import invert, pose, rotation_angle_deg
 from ..recipe import TrackingSection
 from ..types import Float
 from .fragments import Fragment

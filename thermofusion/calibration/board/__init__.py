@@ -1,0 +1,1 @@
+"""Boards to print, and what was seen of them."""

@@ -1,0 +1,1 @@
+"""The thermal camera by itself: curve, field, noise, clock."""

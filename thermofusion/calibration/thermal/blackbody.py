@@ -1,0 +1,173 @@
+"""A session before a blackbody: the table of readings, and the files that a curve and a pixel field are kept in."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from ...errors import ScanError
+from ...files.reading import inside, read_bytes, read_json, read_text
+from ...files.strict import validated
+from ...files.whole import replacing, write_text
+from ...scans.native.schema import SignalDoc
+from ...types import Float
+from .radiometric import PixelField, RadiometricCurve, check_monotone
+from .source import ThermalSource
+
+CURVE_SCHEMA = "thermofusion-curve/1"
+BOX = ("left_px", "top_px", "width_px", "height_px")
+Opener = Callable[[Path], ThermalSource]
+
+
+@dataclass(frozen=True)
+class Box:
+    """A part of a picture, px."""
+
+    left_px: int
+    top_px: int
+    width_px: int
+    height_px: int
+
+    def cut(self, image: Float, place: object = None) -> Float:
+        """That part of (H, W). Raises ScanError if it is not inside."""
+        h, w = image.shape
+        right, bottom = self.left_px + self.width_px, self.top_px + self.height_px
+        if not (0 <= self.left_px < right <= w and 0 <= self.top_px < bottom <= h):
+            raise ScanError(f"the box reaches beyond the picture of {w} x {h} px", place=place)
+        return image[self.top_px : bottom, self.left_px : right]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One temperature of the source: counts, or the recording that shows it (and where, if not everywhere)."""
+
+    degC: float
+    counts: float | None
+    file: Path | None
+    box: Box | None
+    place: str
+
+
+def read_readings(path: Path) -> list[Reading]:
+    """Rows `counts,degC`, or `file,degC` with paths beside the table and, if the source does not fill the picture,
+    `left_px,top_px,width_px,height_px`. Raises ScanError naming the line."""
+    try:
+        reader = csv.DictReader(io.StringIO(read_text(path, "readings"), newline=""))
+        columns = set(reader.fieldnames or ())
+        rows = list(reader)
+    except csv.Error as e:
+        raise ScanError(f"it cannot be read as CSV ({e})", place=path) from None
+    if "degC" not in columns or not columns & {"counts", "file"}:
+        raise ScanError("the columns must be counts,degC or file,degC", place=path)
+    if 0 < len(columns & set(BOX)) < 4:
+        raise ScanError(f"column(s) {', '.join(sorted(set(BOX) - columns))} are missing", place=path)
+    if not rows:
+        raise ScanError("there are no readings", place=path)
+    return [_reading(row, path, f"{path}, line {n}") for n, row in enumerate(rows, 2)]
+
+
+def _reading(row: dict[str, str], path: Path, place: str) -> Reading:
+    name = (row.get("file") or "").strip()
+    try:
+        degC = float(row["degC"])
+        counts = None if name else float(row["counts"])
+        box = Box(*(int(row[k]) for k in BOX)) if name and all(row.get(k) for k in BOX) else None
+    except (KeyError, TypeError, ValueError):
+        raise ScanError("degC, counts and the box must be numbers, or a file be named", place=place) from None
+    if not (np.isfinite(degC) and (counts is None or np.isfinite(counts))):
+        raise ScanError("degC and counts must be finite", place=place)
+    return Reading(degC, counts, inside(path.parent, name, place=place) if name else None, box, place)
+
+
+def reading_counts(readings: list[Reading], opener: Opener) -> Float:
+    """(N,) counts: as written, or the median over the source of the mean of its frames."""
+    return np.array([r.counts if r.counts is not None else _median_counts(r, opener) for r in readings])
+
+
+def _median_counts(reading: Reading, opener: Opener) -> float:
+    assert reading.file is not None
+    mean = opener(reading.file).mean_counts()
+    part = mean if reading.box is None else reading.box.cut(mean, reading.place)
+    return float(np.median(part))
+
+
+# ---------------------------------------------------------------- files
+
+
+class _CurveDoc(BaseModel):
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+    schema_: Literal["thermofusion-curve/1"]
+    signal: SignalDoc
+    counts_range: tuple[float, float]
+    residual_K: float
+    sigma_K: float
+
+
+def curve_document(curve: RadiometricCurve, readings: int) -> dict[str, Any]:
+    """curve.json: `signal` as scan.json takes it, where it holds, and how well."""
+    signal = curve.signal_curve()
+    parameters = {k: list(v) if len(v) > 1 else v[0] for k, v in signal.parameters.items()}
+    return {
+        "schema": CURVE_SCHEMA,
+        "signal": {"kind": signal.kind, "curve": {"type": signal.curve, **parameters}},
+        "counts_range": list(curve.counts_range),
+        "degC_range": sorted(curve.to_degC(np.array(curve.counts_range)).tolist()),
+        "residual_K": curve.residual_K,
+        "sigma_K": curve.sigma_K,
+        "readings": readings,
+    }
+
+
+def write_curve(path: Path, document: dict[str, Any]) -> None:
+    """Write curve.json whole or not at all."""
+    write_text(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
+
+
+def read_curve(path: Path) -> RadiometricCurve:
+    """Read curve.json. Raises ScanError naming the key, or where the curve turns."""
+    raw = read_json(path)
+    if not isinstance(raw, dict) or raw.get("schema") != CURVE_SCHEMA:
+        raise ScanError("this is no curve file", place=path, hint="write one with `thermofusion thermal curve`")
+    doc = validated(_CurveDoc, {"schema_": raw["schema"], **raw}, path)
+    c = doc.signal.curve
+    if c is None or c.type not in ("polynomial", "planck"):
+        raise ScanError("key 'signal.curve': expected a polynomial or planck curve", place=path)
+    values = c.coefficients_degC if c.type == "polynomial" else [getattr(c, k) for k in "RBFO"]
+    if not values or any(v is None for v in values):
+        raise ScanError(f"key 'signal.curve': a number of the {c.type} curve is missing", place=path)
+    lo, hi = doc.counts_range
+    if not lo < hi:
+        raise ScanError("key 'counts_range': expected low < high", place=path)
+    parameters = tuple(float(v) for v in values if v is not None)
+    check_monotone(c.type, parameters, (lo, hi))
+    return RadiometricCurve(c.type, parameters, (lo, hi), doc.residual_K, doc.sigma_K)
+
+
+def write_field(path: Path, field: PixelField) -> None:
+    """Write a pixel field as .npz (`z`: (P, H, W) float32), whole or not at all."""
+    with replacing(path) as temporary, temporary.open("wb") as f:
+        np.savez_compressed(f, z=field.z)
+
+
+def read_field(path: Path) -> PixelField:
+    """Read a pixel field. Raises ScanError if the file is none."""
+    data = read_bytes(path, "field")
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as stored:
+            z = stored["z"]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile):
+        raise ScanError(
+            "this is no pixel field", place=path, hint="write one with `thermofusion thermal field`"
+        ) from None
+    if z.ndim != 3 or z.dtype.kind != "f" or not np.isfinite(z).all():
+        raise ScanError("a pixel field holds finite `z` of three axes: power, row, column", place=path)
+    return PixelField(z.astype(np.float32))

@@ -1,0 +1,104 @@
+"""What works on this machine: versions, the C library, memory, cameras on the bus and the right to open them."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+# Cameras by USB vendor and product (docs/capture facts are public; nothing here was checked on hardware).
+KNOWN_DEVICES = {
+    (0x045E, 0x02B0): "Kinect v1 motor",
+    (0x045E, 0x02AD): "Kinect v1 audio",
+    (0x045E, 0x02AE): "Kinect v1 camera",
+    (0x045E, 0x02BF): "Kinect for Windows camera",
+    (0x3474, 0x45A2): "Thermal Master P3",
+    (0x3474, 0x45C2): "Thermal Master P1",
+    (0x0BDA, 0x5830): "InfiRay P2 Pro / Topdon TC001",
+    (0x1E4E, 0x0100): "PureThermal (FLIR Lepton)",
+    (0x289D, 0x0010): "Seek Compact",
+    (0x289D, 0x0011): "Seek Compact Pro",
+}
+PACKAGES = ("open3d", "numpy", "scipy", "opencv-contrib-python-headless", "pyusb", "libusb-package", "pydantic")
+MIN_MEMORY_GIB = 4.0
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the examination."""
+
+    subject: str
+    status: Literal["ok", "warning", "problem"]
+    text: str
+
+
+def examine() -> list[Finding]:
+    """All findings, cheapest first. Never raises: what cannot be examined is itself a finding."""
+    return [_python(), _libc(), *_packages(), _open3d(), _memory(), *_usb()]
+
+
+def _python() -> Finding:
+    ok = sys.version_info >= (3, 11)
+    return Finding("python", "ok" if ok else "problem", f"{platform.python_version()} on {platform.platform()}")
+
+
+def _libc() -> Finding:
+    name, version = platform.libc_ver()
+    return Finding(
+        "libc", "ok" if name else "warning", f"{name} {version}" if name else "not glibc: wheels may not fit"
+    )
+
+
+def _packages() -> list[Finding]:
+    found = []
+    for name in PACKAGES:
+        try:
+            found.append(Finding(name, "ok", importlib.metadata.version(name)))
+        except importlib.metadata.PackageNotFoundError:
+            found.append(Finding(name, "problem", f"not installed; run `pip install {name}`"))
+    return found
+
+
+def _open3d() -> Finding:
+    try:
+        from ..geometry._open3d import o3d
+    except Exception as e:  # a wheel that does not load raises OSError, ImportError and others
+        return Finding("open3d loads", "problem", f"{type(e).__name__}: {e}")
+    return Finding(
+        "open3d loads", "ok", f"CPU; CUDA {'available' if o3d.core.cuda.is_available() else 'not available'}"
+    )
+
+
+def _memory() -> Finding:
+    try:
+        gib = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    except (ValueError, OSError):
+        return Finding("memory", "warning", "unknown")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return Finding("memory", "ok" if gib >= MIN_MEMORY_GIB else "warning", f"{gib:.1f} GiB, {cores} cores")
+
+
+def _usb() -> list[Finding]:
+    try:
+        import libusb_package
+        import usb.core
+
+        devices = list(usb.core.find(find_all=True, backend=libusb_package.get_libusb1_backend()) or [])
+    except Exception as e:
+        return [
+            Finding("usb", "warning", f"the bus cannot be listed ({type(e).__name__}: {e}); recording will not work")
+        ]
+    found = []
+    for device in devices:
+        name = KNOWN_DEVICES.get((device.idVendor, device.idProduct))
+        if name is None:
+            continue
+        node = Path(f"/dev/bus/usb/{device.bus:03d}/{device.address:03d}")
+        allowed = not node.exists() or os.access(node, os.R_OK | os.W_OK)
+        hint = "" if allowed else f"; no permission on {node}: add a udev rule for it"
+        found.append(Finding("usb", "ok" if allowed else "problem", f"{name} at {device.bus}:{device.address}{hint}"))
+    return found or [Finding("usb", "ok", f"{len(devices)} devices on the bus, no camera known to thermofusion")]

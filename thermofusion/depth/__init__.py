@@ -1,0 +1,1 @@
+"""Which depth is believed, and which of it is the subject."""

@@ -1,0 +1,1 @@
+"""Files and folders: safe reading, whole writing, strict documents."""

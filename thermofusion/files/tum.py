@@ -1,0 +1,79 @@
+"""Poses as rows of TUM text, for evo and every SLAM tool: `time_s tx ty tz qx qy qz qw` of T_world_depth, metres."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ..errors import ScanError
+from ..types import Float, Trajectory, check_rigid
+from .reading import read_numbers
+from .whole import write_whole
+
+HEAD = "# time_s tx ty tz qx qy qz qw: T_world_depth, metres"
+MAX_POSITION_M = 1000.0  # a pose farther from the origin is in other units than metres
+POSE_TOLERANCE = 1e-2  # deviation of RᵀR from identity in a recorded pose
+UNIT_TOLERANCE = 0.02  # of a quaternion's length: rows with four digits are still unit quaternions
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """The trajectory of a file; `#` starts a comment.
+
+    Raises ScanError naming the pose that cannot be used.
+    """
+    rows = read_numbers(path, columns=8)
+    if len(rows) == 0:
+        raise ScanError("the trajectory has no poses", place=path, hint="delete the file to have poses estimated")
+    bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+    if len(bad):
+        text = "expected eight finite numbers `time_s tx ty tz qx qy qz qw`"
+        raise ScanError(text, place=f"{path}, pose {bad[0] + 1}")
+    bad = np.flatnonzero(np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1) > UNIT_TOLERANCE)
+    if len(bad):
+        raise ScanError("the quaternion's length is not 1", place=f"{path}, pose {bad[0] + 1}")
+    T = np.tile(np.eye(4), (len(rows), 1, 1))
+    T[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
+    T[:, :3, 3] = rows[:, 1:4]
+    return poses_to_trajectory(rows[:, 0], T, place=path)
+
+
+def write_trajectory(path: str | Path, trajectory: Trajectory, *, exact: bool = False) -> Path:
+    """Write a trajectory; returns the path. Quaternions have qw >= 0.
+
+    exact : digits enough to read the same numbers back; else microseconds and nanometres. Raises ResourceError.
+    """
+    T = trajectory.T_world_depth
+    q = Rotation.from_matrix(T[:, :3, :3]).as_quat(canonical=True)
+    rows = np.column_stack([trajectory.times_s, T[:, :3, 3], q]).tolist()
+    if exact:
+        lines = [" ".join(map(repr, row)) for row in rows]
+    else:
+        lines = [f"{row[0]:.6f} " + " ".join(f"{x:.9f}" for x in row[1:]) for row in rows]
+    return write_whole(path, ["\n".join([HEAD, *lines, ""]).encode()])
+
+
+def poses_to_trajectory(times_s: NDArray, poses: NDArray, *, place: object) -> Trajectory:
+    """(N, 4, 4) T_world_depth in metres with their times; rotations are made exactly orthonormal.
+
+    Raises ScanError for a pose that is no rigid transform to `POSE_TOLERANCE`.
+    """
+    try:
+        T = np.stack([_nearest_rigid(M, f"pose {i}") for i, M in enumerate(poses)])
+        trajectory = Trajectory(times_s, T)
+    except ValueError as e:
+        raise ScanError(str(e), place=place) from None
+    if np.abs(T[:, :3, 3]).max() > MAX_POSITION_M:
+        raise ScanError(f"a pose lies more than {MAX_POSITION_M:.0f} m from the origin, expected metres", place=place)
+    return trajectory
+
+
+def _nearest_rigid(M: NDArray, name: str) -> Float:
+    """The rigid transform nearest to a rounded one: published poses are off by up to a few 1e-3."""
+    R = M[:3, :3]
+    if np.isfinite(R).all() and np.abs(R.T @ R - np.eye(3)).max() <= POSE_TOLERANCE and np.linalg.det(R) > 0:
+        U, _, Vt = np.linalg.svd(R)
+        M = np.block([[U @ Vt, M[:3, 3:]], [M[3:]]])
+    return check_rigid(M, name)

@@ -1,0 +1,101 @@
+"""Files and folders that appear whole or not at all: the one place that makes temporary names and renames them."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ResourceError
+
+
+@contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """A temporary path in the same folder that becomes `path` when the block ends well, and vanishes otherwise.
+
+    The file reaches the disk before its name does; its permissions are what the user's umask leaves. Raises
+    ResourceError where the folder or the disk refuses.
+    """
+    path = Path(path)
+    with _refusals(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(f".{path.name[:100]}.{os.getpid()}.{os.urandom(4).hex()}.part{path.suffix}")
+        try:
+            os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+            yield temporary
+            _to_disk(temporary)
+            temporary.replace(path)
+            _to_disk(path.parent)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+def write_whole(path: str | Path, chunks: Iterable[bytes | NDArray]) -> Path:
+    """Write bytes and arrays (any shape, in C order) one after another; returns the path. Raises ResourceError."""
+    with replacing(path) as temporary, temporary.open("wb") as f:
+        for chunk in chunks:
+            if isinstance(chunk, np.ndarray):
+                chunk.tofile(f)
+            else:
+                f.write(chunk)
+    return Path(path)
+
+
+def write_text(path: str | Path, text: str) -> Path:
+    """Write a text file in UTF-8; returns the path. Raises ResourceError."""
+    return write_whole(path, [text.encode()])
+
+
+@contextmanager
+def replacing_folder(out: Path) -> Iterator[Path]:
+    """A temporary folder beside `out` that takes its place when the block ends well, and vanishes otherwise.
+
+    An old folder of that name goes only after the new one stands. Raises ResourceError.
+    """
+    with _refusals(out):
+        out.parent.mkdir(parents=True, exist_ok=True)
+        folder = Path(tempfile.mkdtemp(prefix=f".{out.name[:100]}.", dir=out.parent))
+        try:
+            yield folder
+            folder.chmod(0o777 & ~_umask())  # mkdtemp's 0700 would hide the folder from whom the umask admits
+            old = folder.with_name(folder.name + ".old")
+            if out.exists():
+                out.rename(old)
+            folder.rename(out)
+            _to_disk(out.parent)
+            shutil.rmtree(old, ignore_errors=True)
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def _refusals(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as e:
+        place = path if e.filename is None or Path(e.filename).name.startswith(".") else e.filename
+        raise ResourceError(f"it cannot be written ({e.strerror})", place=place, hint="free some space") from None
+
+
+def _to_disk(path: Path) -> None:
+    """Wait until a file's content, or a folder's names, are on the disk; folders only where the system can."""
+    if path.is_dir() and os.name != "posix":
+        return
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        with suppress(OSError):  # some file systems refuse it for folders, some (FUSE) for files
+            os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _umask() -> int:
+    mask = os.umask(0o077)
+    os.umask(mask)
+    return mask

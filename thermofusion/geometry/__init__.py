@@ -1,0 +1,1 @@
+"""Pure geometry: rigid motions, cameras, meshes, planes, rays, outlines. Knows neither recordings nor recipes."""

@@ -1,0 +1,94 @@
+"""Rigid motions and the pinhole camera: pure NumPy (and SciPy's rotations).
+
+Frames: `T_a_b` (4x4) takes a point from frame b to frame a, p_a = T_a_b p_b. Camera: x right, y down, z forward; the
+centre of the first pixel is (0, 0) (paper Eqs. 2-8, with OpenCV's coefficient order).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..types import Camera, Float
+
+# ---------------------------------------------------------------- the camera
+
+
+def distort(x: NDArray, y: NDArray, distortion: Float) -> tuple[NDArray, NDArray]:
+    """Ideal image-plane coordinates (z = 1) to distorted ones; OpenCV's rational + tangential model (Eqs. 6-7)."""
+    k1, k2, p1, p2, k3 = distortion[:5]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    if len(distortion) == 8:
+        k4, k5, k6 = distortion[5:]
+        radial = radial / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    xy2 = 2 * x * y
+    return x * radial + p1 * xy2 + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + p2 * xy2
+
+
+def undistort(x_d: NDArray, y_d: NDArray, distortion: Float, *, iterations: int = 30) -> tuple[NDArray, NDArray]:
+    """Inverse of `distort` by fixed-point iteration with a Newton-like scale; NaN where it does not converge."""
+    x, y = np.array(x_d, np.float64), np.array(y_d, np.float64)
+    if not np.any(distortion):
+        return x, y
+    for _ in range(iterations):
+        fx, fy = distort(x, y, distortion)
+        x, y = x + (x_d - fx), y + (y_d - fy)
+    fx, fy = distort(x, y, distortion)
+    lost = ~(np.hypot(fx - x_d, fy - y_d) < 1e-6)
+    x[lost] = y[lost] = np.nan
+    return x, y
+
+
+def max_image_radius(distortion: Float) -> float:
+    """Largest ideal radius r up to which the radial model is increasing.
+
+    Beyond it a barrel-distorted model folds back: points far outside the field of view would land *inside* the image.
+    """
+    if not np.any(distortion):
+        return np.inf
+    r = np.linspace(0, 4, 8001)
+    radial = distort(r, np.zeros_like(r), np.concatenate([distortion[:2], [0, 0], distortion[4:]]))[0]
+    falling = np.flatnonzero(~(np.diff(radial) > 0))
+    return float(r[falling[0]]) if len(falling) else np.inf
+
+
+def project(camera: Camera, points: NDArray) -> tuple[NDArray, NDArray]:
+    """Points (N, 3) in the camera's frame to pixels (N, 2) (NaN: behind, or outside the model) and z (N,)."""
+    z = points[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, y = points[:, 0] / z, points[:, 1] / z
+        ok = (z > 1e-6) & (x * x + y * y < max_image_radius(camera.distortion) ** 2)
+        x_d, y_d = distort(x, y, camera.distortion.astype(points.dtype))
+        K = camera.K.astype(points.dtype)
+        uv = np.stack([K[0, 0] * x_d + K[0, 2], K[1, 1] * y_d + K[1, 2]], axis=1)
+    uv[~ok] = np.nan
+    return uv, z
+
+
+def pixel_rays(camera: Camera, u_px: NDArray | None = None, v_px: NDArray | None = None) -> Float:
+    """Unit direction of each pixel's own ray in the camera's frame, (..., 3); the whole image (H, W, 3) by default."""
+    if u_px is None or v_px is None:
+        u_px, v_px = np.meshgrid(
+            np.arange(camera.width_px, dtype=np.float64), np.arange(camera.height_px, dtype=np.float64)
+        )
+    x_d = (u_px - camera.K[0, 2]) / camera.K[0, 0]
+    y_d = (v_px - camera.K[1, 2]) / camera.K[1, 1]
+    x, y = undistort(x_d, y_d, camera.distortion)
+    d = np.stack([x, y, np.ones_like(x)], axis=-1)
+    return d / np.linalg.norm(d, axis=-1, keepdims=True)
+
+
+def backproject(camera: Camera, depth_m: NDArray) -> Float:
+    """Depth image (H, W) in metres along z, NaN = none, to points (H, W, 3) in the camera's frame."""
+    rays = pixel_rays(camera)
+    return rays * (depth_m / rays[..., 2])[..., None]
+
+
+def viewing_cosine(points: NDArray, normals: NDArray, eye: NDArray) -> NDArray:
+    """Cosine of the viewing angle: between the unit normal and the ray from the surface to the eye, (N,).
+
+    The pixel's own ray, not the camera axis of the paper's Eq. 28; negative for back faces.
+    """
+    d = eye.astype(points.dtype) - points
+    return np.einsum("ij,ij->i", d, normals) / np.sqrt(np.einsum("ij,ij->i", d, d))

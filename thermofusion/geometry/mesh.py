@@ -1,0 +1,144 @@
+"""Triangle meshes as plain arrays: order, pieces, floor, smoothing, normals. NumPy and SciPy, no Open3D, no files."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix, diags
+from scipy.sparse.csgraph import connected_components
+
+from ..types import Bool, Float, Float32, Int
+
+TAUBIN_SHRINK, TAUBIN_INFLATE = 0.5, -0.53  # low pass without shrinkage (Taubin 1995)
+
+
+def canonical(vertices: Float32, triangles: NDArray) -> tuple[Float32, Int]:
+    """The same surface in an order that depends on its shape alone.
+
+    Marching cubes on a hash map deliver vertices in any order. Here vertices (V, 3) are sorted by z, y, x, and equal
+    ones merged; triangles lose degenerate ones, start at their lowest vertex, and are sorted.
+    """
+    vertices = vertices + np.float32(0)  # -0.0 becomes 0.0: equal numbers get equal bits
+    order = np.lexsort(vertices.T)
+    ordered = vertices[order]
+    first = np.ones(len(order), bool)
+    first[1:] = (ordered[1:] != ordered[:-1]).any(1)
+    new = np.empty(len(order), np.int32)
+    new[order] = np.cumsum(first) - 1
+    tri = new[triangles]
+    tri = tri[(tri[:, 0] != tri[:, 1]) & (tri[:, 1] != tri[:, 2]) & (tri[:, 2] != tri[:, 0])]
+    return ordered[first], _in_order(tri)
+
+
+def _in_order(triangles: Int) -> Int:
+    """Triangles that start at their lowest vertex, sorted."""
+    lead = triangles.argmin(1)[:, None]
+    tri = np.take_along_axis(triangles, (lead + np.arange(3)) % 3, axis=1)
+    return tri[np.lexsort((tri[:, 2], tri[:, 1], tri[:, 0]))]
+
+
+def triangle_normals(vertices: Float32, triangles: Int) -> Float32:
+    """(F, 3) cross product of each triangle: outward, its length twice the area [m²]."""
+    a, b, c = (vertices[triangles[:, i]] for i in range(3))
+    return np.cross(b - a, c - a)
+
+
+def vertex_sums(values: NDArray, triangles: Int, count: int) -> Float:
+    """Sum over the triangles at each vertex: (F,) or (F, C) -> (count,) or (count, C)."""
+    columns = values.reshape(len(triangles), -1)
+    corners = triangles.ravel()
+    out: Float = np.stack([np.bincount(corners, np.repeat(c, 3).astype(np.float64), count) for c in columns.T], axis=1)
+    return out[:, 0] if values.ndim == 1 else out
+
+
+def vertex_areas(vertices: Float32, triangles: Int) -> Float:
+    """(V,) m²: a third of the area of the triangles at each vertex."""
+    return vertex_sums(np.linalg.norm(triangle_normals(vertices, triangles), axis=1) / 6, triangles, len(vertices))
+
+
+def components(triangles: Int, count: int) -> Int:
+    """(V,) number of the connected piece each vertex belongs to."""
+    along = (triangles[:, :2].ravel(), triangles[:, 1:].ravel())  # two sides of a triangle connect its three corners
+    graph = csr_matrix((np.ones(len(along[0]), np.int8), along), shape=(count, count))
+    return connected_components(graph, directed=False)[1].astype(np.int32)
+
+
+def keep_vertices(vertices: Float32, triangles: Int, keep: Bool) -> tuple[Float32, Int]:
+    """The triangles whose three vertices are all kept, and the vertices these use; order is preserved."""
+    tri = triangles[keep[triangles].all(1)]
+    used = np.zeros(len(vertices), bool)
+    used[tri] = True
+    new = np.cumsum(used, dtype=np.int32) - 1
+    return vertices[used], new[tri]
+
+
+def close_pinholes(vertices: Float32, triangles: Int, max_round_m: float) -> Int:
+    """The triangles in `canonical` order, with fans over holes whose border is no longer than `max_round_m`.
+
+    A pinhole is a voxel that too few frames filled. It is no edge of the subject, but would be taken for one wherever
+    silhouettes and open borders are kept clear of. No vertex is added. Holes that touch in a vertex stay open.
+    """
+    n = len(vertices)
+    ends = (triangles.ravel(), triangles[:, [1, 2, 0]].ravel())
+    along = csr_matrix((np.ones(len(ends[0]), np.int8), ends), shape=(n, n))
+    once = (along - along.T).tocoo()  # edges that no other triangle runs back along
+    a, b = once.row[once.data > 0], once.col[once.data > 0]
+    lone = (np.bincount(a, minlength=n)[a] == 1) & (np.bincount(b, minlength=n)[b] == 1)
+    follower = dict(zip(a[lone].tolist(), b[lone].tolist(), strict=True))
+    fans: list[tuple[int, int, int]] = []
+    while follower:
+        start, following = follower.popitem()
+        loop = [start]
+        while following != start and following in follower:
+            loop.append(following)
+            following = follower.pop(following)
+        border = vertices[loop]
+        length = float(np.linalg.norm(border - np.roll(border, -1, axis=0), axis=1).sum())
+        if following == start and len(loop) >= 3 and length <= max_round_m:
+            loop = loop[(k := int(np.argmin(loop))) :] + loop[:k]  # whatever the border's start
+            fans += [(loop[0], loop[i + 1], loop[i]) for i in range(1, len(loop) - 1)]
+    if not fans:
+        return triangles
+    return _in_order(np.concatenate([triangles, np.array(fans, np.int32)]))
+
+
+def smooth_positions(vertices: Float32, triangles: Int, iterations: int) -> Float32:
+    """Taubin smoothing: `iterations` pairs of a shrinking and an inflating step. Vertices (V, 3) m."""
+    if iterations == 0:
+        return vertices
+    mean = _average(triangles, len(vertices), self_weight=0.0)
+    out = vertices
+    for _ in range(iterations):
+        for factor in (TAUBIN_SHRINK, TAUBIN_INFLATE):
+            out = out + np.float32(factor) * (mean @ out - out)
+    return out.astype(np.float32)
+
+
+def mesh_normals(vertices: Float32, triangles: Int, *, steps: int = 2) -> Float32:
+    """Unit outward normals (V, 3): area-weighted triangle normals, averaged over the neighbours `steps` times.
+
+    They never mix a finger with its neighbour, but an irregular mesh makes them less exact than a plane fit.
+    """
+    n = vertex_sums(triangle_normals(vertices, triangles), triangles, len(vertices)).astype(np.float32)
+    mean = _average(triangles, len(vertices), self_weight=1.0)
+    for _ in range(steps):
+        n = mean @ n
+    return unit(n)
+
+
+def unit(n: Float32) -> Float32:
+    """Rows of (N, 3) at length 1; NaN where the length is 0."""
+    length = np.sqrt(np.einsum("ij,ij->i", n, n))[:, None]
+    return np.divide(n, length, out=np.full_like(n, np.nan), where=length > 0)
+
+
+def _average(triangles: Int, count: int, self_weight: float) -> csr_matrix:
+    """Sparse (V, V) float32 matrix that takes the mean over each vertex's neighbours and, with a weight, itself.
+
+    Going round its triangles names every neighbour of a vertex once (on an open border, all but one).
+    """
+    ones = np.ones(3 * len(triangles), np.float32)
+    A = csr_matrix((ones, (triangles.ravel(), triangles[:, [1, 2, 0]].ravel())), shape=(count, count))
+    A = A + diags(np.full(count, np.float32(self_weight)), format="csr", dtype=np.float32)
+    total = np.asarray(A.sum(1), np.float32).ravel()
+    return (diags(1 / np.maximum(total, np.float32(1e-12)), dtype=np.float32) @ A).tocsr()

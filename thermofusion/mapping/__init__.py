@@ -1,0 +1,1 @@
+"""Thermal views onto the surface: what each vertex was seen to radiate."""

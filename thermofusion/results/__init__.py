@@ -1,0 +1,1 @@
+"""Result folders: stored nouns, stages, files written and read again."""

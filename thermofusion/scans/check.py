@@ -1,0 +1,384 @@
+"""Is this recording usable, and how good is it? Findings for people, faults as exceptions, overlay pictures as arrays.
+
+`verify` is quick and stops a run before it has cost anything; `check_scan` looks at more and never stops.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ScanError
+from ..geometry.camera import project
+from ..geometry.rigid import rotation_angle_deg, transform_points
+from ..physics.band import ZERO_DEGC_K
+from ..physics.signal import SignalConverter
+from ..types import Camera, Float, Scan, Stream, UInt8
+from .overlay import OVERLAY_FRAMES, edge_overlays
+from .pairing import nearest_in_time
+
+DEPTH_RANGE_M = (0.15, 9.0)  # a room's median depth lies inside, whatever the camera; outside, the unit is wrong
+BODY_RANGE_M = (0.3, 4.5)  # where a body scan's median depth is expected
+APPARENT_RANGE_DEGC = (-10.0, 80.0)  # the median of a frame with a body, or a phantom, in a room lies inside
+MAX_BASELINE_M, MAX_ANGLE_DEG = 0.5, 45.0  # between cameras on one rig
+MAX_OVERLAY_SHIFT_PX = 4.0  # a picture that fits better elsewhere by more is worth a warning
+MIN_OVERLAY_CONTRAST = 1.25  # below, the best shift says nothing
+
+Severity = Literal["ok", "warning", "error"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing found. severity : `error` makes a scan unusable."""
+
+    severity: Severity
+    subject: str
+    text: str
+
+
+@dataclass(frozen=True)
+class StreamFigures:
+    """A stream in numbers. jitter_ms : 95th percentile of |step - median step|. longest_gap_s : largest step."""
+
+    frames: int
+    usable: int
+    width_px: int
+    height_px: int
+    duration_s: float
+    rate_hz: float | None
+    jitter_ms: float | None
+    longest_gap_s: float | None
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """What `check_scan` found.
+
+    missing : metadata that the recording does not state and that would make the result better.
+    depth_coverage : share of pixels with depth, mean of the sampled frames. median_depth_m : of all sampled pixels.
+    thermal_degC : 1st, 50th and 99th percentile of the sampled thermal frames, apparent.
+    seen_by_thermal : share of the depth points that project into the thermal image.
+    overlay_shift_px : by camera, (du, dv) that would bring depth edges best onto the image's edges, where it says
+        anything.
+    """
+
+    name: str
+    format: str
+    findings: tuple[Finding, ...]
+    streams: dict[str, StreamFigures]
+    missing: tuple[str, ...]
+    unusable: bool
+    depth_coverage: float | None = None
+    median_depth_m: float | None = None
+    thermal_degC: tuple[float, float, float] | None = None
+    seen_by_thermal: float | None = None
+    overlay_shift_px: dict[str, tuple[float, float]] = field(default_factory=dict)
+
+    def text(self) -> str:
+        """The report in lines for people."""
+        lines = [f"{self.name} ({self.format})"]
+        for name, s in self.streams.items():
+            rate = "" if s.rate_hz is None else f", {s.rate_hz:.2f} Hz, jitter {s.jitter_ms:.1f} ms"
+            skipped = "" if s.usable == s.frames else f", {s.frames - s.usable} marked unusable"
+            size = f"{s.width_px} x {s.height_px}"
+            lines.append(f"  {name:<8} {s.frames} frames {size}, {s.duration_s:.2f} s{rate}{skipped}")
+        sign = {"ok": "ok     ", "warning": "warning", "error": "ERROR  "}
+        lines += [f"{sign[f.severity]}  {f.subject}: {f.text}" for f in self.findings]
+        if self.missing:
+            lines.append(f"not stated: {'; '.join(self.missing)}")
+        return "\n".join(lines)
+
+
+# ---------------------------------------------------------------- before a run
+
+
+def verify(scan: Scan, sample: int = 3) -> None:
+    """Find faults before work starts: `sample` frames of each stream are decoded, times and cameras compared.
+
+    Raises ScanError with one sentence: a frame that cannot be decoded, a depth unit that looks wrong, no depth at all
+    ("empty mask"), thermal values off their curve, streams without common time, cameras without a common view.
+    """
+    for fault in _faults(scan, sample):
+        raise fault
+
+
+def _faults(scan: Scan, sample: int) -> Iterator[ScanError]:
+    """All faults that make a scan unusable, most basic first."""
+    for step in (_time_faults, _depth_faults, _color_faults, _thermal_faults):
+        try:
+            step(scan, sample)
+        except ScanError as fault:
+            yield fault
+
+
+def _sample(stream: Stream, sample: int, *, usable_only: bool = True) -> list[int]:
+    """Positions of `sample` frames from first to last."""
+    rows = np.flatnonzero(stream.usable) if usable_only and stream.usable.any() else np.arange(len(stream))
+    picks = np.linspace(0, len(rows) - 1, min(max(sample, 1), len(rows))).round().astype(int)
+    return rows[np.unique(picks)].tolist()
+
+
+def _time_faults(scan: Scan, sample: int) -> None:
+    t = scan.depth.times_s
+    slack = 1.0 if len(t) < 2 else 0.5 * float(np.median(np.diff(t))) + 1e-3
+    offset = 0.0 if scan.sensor is None else scan.sensor.time_offset_s
+    others = {
+        "colour": None if scan.color is None else scan.color.times_s,
+        "thermal": None if scan.thermal is None else scan.thermal.times_s + offset,
+        "trajectory": None if scan.trajectory is None else scan.trajectory.times_s,
+    }
+    for name, u in others.items():
+        if u is not None and (u[0] > t[-1] + slack or u[-1] < t[0] - slack):
+            raise ScanError(
+                f"depth ({t[0]:.3f} to {t[-1]:.3f} s) and {name} ({u[0]:.3f} to {u[-1]:.3f} s) have no time in common",
+                place=scan.root,
+                hint="all streams must be on one clock",
+            )
+
+
+def _depth_faults(scan: Scan, sample: int) -> None:
+    picks = _sample(scan.depth, sample)
+    frames = [scan.depth.load(i) for i in picks]
+    measured = np.concatenate([d[np.isfinite(d)] for d in frames])
+    if measured.size == 0:
+        raise ScanError(
+            f"the depth mask is empty: none of {len(picks)} sampled frames has a single measurement",
+            place=scan.depth.places[picks[0]],
+        )
+    median = float(np.median(measured))
+    if not DEPTH_RANGE_M[0] <= median <= DEPTH_RANGE_M[1]:
+        raise ScanError(
+            f"the depth unit looks wrong: with {scan.depth_unit_m:g} m a step the median depth is {median:.3g} m",
+            place=scan.root,
+            hint="set cameras.depth.depth_unit_m (0.001 for millimetres)",
+        )
+    if scan.rig.thermal is not None and scan.rig.T_thermal_depth is not None and scan.thermal is not None:
+        seen = [_share_seen(d, scan.rig.depth, scan.rig.thermal, scan.rig.T_thermal_depth) for d in frames]
+        if max(seen) == 0:
+            raise ScanError(
+                "no depth point of the sampled frames projects into the thermal image: the cameras share no view",
+                place=scan.root,
+                hint="check extrinsics.T_thermal_depth and cameras.thermal.K",
+            )
+
+
+def _share_seen(depth: NDArray, camera: Camera, other: Camera, T_other_depth: Float, step: int = 8) -> float:
+    """Share of the depth points (every `step`th pixel) that project into another camera's image."""
+    v, u = np.mgrid[0 : depth.shape[0] : step, 0 : depth.shape[1] : step]
+    z = depth[::step, ::step].astype(np.float64)
+    K = camera.K
+    points = np.stack([(u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z], axis=-1)
+    points = points[np.isfinite(z)]
+    if len(points) == 0:
+        return 0.0
+    uv, _ = project(other, transform_points(T_other_depth, points))
+    with np.errstate(invalid="ignore"):
+        inside = (uv >= 0).all(1) & (uv[:, 0] <= other.width_px - 1) & (uv[:, 1] <= other.height_px - 1)
+    return float(inside.mean())
+
+
+def _color_faults(scan: Scan, sample: int) -> None:
+    if scan.color is not None:
+        for i in _sample(scan.color, sample):
+            scan.color.load(i)
+
+
+def _thermal_faults(scan: Scan, sample: int) -> None:
+    if scan.thermal is None:
+        return
+    if scan.sensor is None:
+        raise ScanError("the thermal camera has no radiometry", place=scan.root, hint="state cameras.thermal.signal")
+    if not scan.thermal.usable.any():
+        raise ScanError("every thermal frame is marked as taken during a shutter correction", place=scan.root)
+    convert = SignalConverter(scan.sensor)
+    for i in _sample(scan.thermal, sample):
+        degC = _apparent_degC(scan, convert, i)
+        if not np.isfinite(degC).any():
+            raise ScanError("the thermal frame has no measurement at all", place=scan.thermal.places[i])
+        median = float(np.nanmedian(degC))
+        if not APPARENT_RANGE_DEGC[0] <= median <= APPARENT_RANGE_DEGC[1]:
+            raise ScanError(
+                f"the thermal signal looks wrong: its median is {median:.0f} degC",
+                place=scan.thermal.places[i],
+                hint="check cameras.thermal.signal, and the byte order of the images",
+            )
+
+
+def _apparent_degC(scan: Scan, convert: SignalConverter, i: int) -> Float:
+    """Apparent temperature of every 4th pixel of a thermal frame."""
+    assert scan.thermal is not None
+    radiance = convert.radiance(scan.thermal.load(i), scan.thermal.places[i])
+    return convert.band.temperature_K(radiance[::4, ::4]) - ZERO_DEGC_K
+
+
+# ---------------------------------------------------------------- the whole check
+
+
+def check_scan(scan: Scan, sample: int = 9) -> CheckReport:
+    """Look at a recording: rates, gaps, synchronisation, units, extrinsics, coverage, overlays, missing metadata.
+
+    Never raises for a faulty scan: what `verify` would raise is a finding of severity `error`.
+    """
+    faults = list(_faults(scan, sample))
+    findings = [Finding("error", f.place or "scan", f"{f.cause}{f'; {f.hint}' if f.hint else ''}") for f in faults]
+    streams = {
+        name: _figures(stream, camera)
+        for name, stream, camera in (
+            ("depth", scan.depth, scan.rig.depth),
+            ("color", scan.color, scan.rig.color),
+            ("thermal", scan.thermal, scan.rig.thermal),
+        )
+        if stream is not None and camera is not None
+    }
+    findings += _rate_findings(streams)
+    findings += _sync_findings(scan)
+    findings += _extrinsic_findings(scan)
+    if scan.thermal is None:
+        findings.append(Finding("warning", "thermal", "there is no thermal stream: geometry only"))
+    findings += [Finding("warning", "reader", note) for note in scan.notes]
+    figures: dict = {}
+    if not faults:
+        figures = _measure(scan, sample)
+        findings += _figure_findings(figures)
+    if not any(f.severity == "error" for f in findings):
+        findings.insert(0, Finding("ok", "scan", "every sampled frame decodes; units and times are plausible"))
+    return CheckReport(
+        name=scan.name,
+        format=scan.format,
+        findings=tuple(findings),
+        streams=streams,
+        missing=missing_metadata(scan),
+        unusable=bool(faults),
+        **figures,
+    )
+
+
+def overlays(scan: Scan, count: int = OVERLAY_FRAMES) -> dict[str, UInt8]:
+    """Pictures (H, W, 3) uint8 by name: depth edges drawn over thermal and colour images of a few frames.
+
+    Where the green lines leave the subject's outline, the rig is wrong (or the clock: then the sides of a moving view
+    differ). Raises ScanError if a frame cannot be decoded.
+    """
+    return {o.name: o.picture for o in edge_overlays(scan, count)}
+
+
+def missing_metadata(scan: Scan) -> tuple[str, ...]:
+    """What the recording does not state and a quantitative result should."""
+    e = scan.environment
+    thermal = scan.thermal is not None
+    entries = (
+        (thermal and e.reflected_degC is None, "environment.reflected_degC (temperature of the surroundings)"),
+        (thermal and e.air_degC is None, "environment.air_degC"),
+        (thermal and e.relative_humidity_pct is None, "environment.relative_humidity_pct"),
+        (thermal and not scan.references, "references (without one the level is relative, not absolute)"),
+        (thermal and scan.sensor is not None and scan.sensor.psf_sigma_px is None, "cameras.thermal.psf_sigma_px"),
+        (scan.recorded_at is None, "recorded_at"),
+        ("posture" not in scan.subject, "subject.posture"),
+        ("acclimatisation_min" not in scan.subject, "subject.acclimatisation_min"),
+    )
+    return tuple(text for absent, text in entries if absent)
+
+
+def _figures(stream: Stream, camera: Camera) -> StreamFigures:
+    t = stream.times_s
+    base = (len(stream), int(stream.usable.sum()), camera.width_px, camera.height_px, float(t[-1] - t[0]))
+    if len(t) < 3:
+        return StreamFigures(*base, None, None, None)
+    step = np.diff(t)
+    median = float(np.median(step))
+    jitter = float(np.percentile(np.abs(step - median), 95)) * 1e3
+    return StreamFigures(*base, 1 / median, jitter, float(step.max()))
+
+
+def _rate_findings(streams: dict[str, StreamFigures]) -> list[Finding]:
+    found = []
+    for name, s in streams.items():
+        if s.rate_hz is not None and s.longest_gap_s is not None and s.longest_gap_s * s.rate_hz > 3.5:
+            lost = round(s.longest_gap_s * s.rate_hz) - 1
+            found.append(Finding("warning", name, f"a gap of {s.longest_gap_s:.3f} s, about {lost} frames lost"))
+    return found
+
+
+def _sync_findings(scan: Scan) -> list[Finding]:
+    found = []
+    if scan.color is not None:
+        _, dt = nearest_in_time(scan.depth.times_s, scan.color.times_s)
+        severity: Severity = "ok" if np.median(np.abs(dt)) < 0.04 else "warning"
+        text = f"nearest colour frame {np.median(dt) * 1e3:+.1f} ms (median), {np.abs(dt).max() * 1e3:.1f} ms at most"
+        found.append(Finding(severity, "sync colour", text))
+    if scan.thermal is not None:
+        offset = 0.0 if scan.sensor is None else scan.sensor.time_offset_s
+        t = scan.thermal.times_s + offset
+        outside = int(((t < scan.depth.times_s[0] - 0.1) | (t > scan.depth.times_s[-1] + 0.1)).sum())
+        if outside:
+            found.append(Finding("warning", "sync thermal", f"{outside} of {len(t)} frames lie outside depth's time"))
+        _, dt = nearest_in_time(t, scan.depth.times_s)
+        away = np.median(np.abs(dt)) * 1e3
+        text = f"nearest depth frame {away:.1f} ms away (median); clock offset {offset * 1e3:+.1f} ms"
+        found.append(Finding("ok", "sync thermal", text))
+    return found
+
+
+def _extrinsic_findings(scan: Scan) -> list[Finding]:
+    found = []
+    for name in ("thermal", "color"):
+        T = getattr(scan.rig, f"T_{name}_depth")
+        if T is None:
+            continue
+        baseline, angle = float(np.linalg.norm(T[:3, 3])), float(rotation_angle_deg(T))
+        text = f"{baseline * 1e3:.0f} mm and {angle:.1f} deg from depth"
+        odd = baseline > MAX_BASELINE_M or angle > MAX_ANGLE_DEG
+        if name == "thermal" and np.abs(T - np.eye(4)).max() < 1e-9:
+            odd, text = True, "T_thermal_depth is the identity: was it calibrated?"
+        found.append(Finding("warning" if odd else "ok", f"extrinsic {name}", text))
+    return found
+
+
+def _measure(scan: Scan, sample: int) -> dict:
+    """The report's figures from sampled frames."""
+    picks = _sample(scan.depth, sample)
+    depth = [scan.depth.load(i) for i in picks]
+    measured = np.concatenate([d[np.isfinite(d)] for d in depth])
+    out: dict = {
+        "depth_coverage": float(np.mean([np.isfinite(d).mean() for d in depth])),
+        "median_depth_m": float(np.median(measured)),
+    }
+    if scan.thermal is not None and scan.sensor is not None:
+        convert = SignalConverter(scan.sensor)
+        degC = np.stack([_apparent_degC(scan, convert, i) for i in _sample(scan.thermal, sample)])
+        out["thermal_degC"] = tuple(float(x) for x in np.nanpercentile(degC, [1, 50, 99]))
+        if scan.rig.thermal is not None and scan.rig.T_thermal_depth is not None:
+            camera, T = scan.rig.thermal, scan.rig.T_thermal_depth
+            out["seen_by_thermal"] = float(np.mean([_share_seen(d, scan.rig.depth, camera, T) for d in depth]))
+    shifts: dict[str, list[tuple[float, float]]] = {}
+    for o in edge_overlays(scan, OVERLAY_FRAMES):
+        if o.contrast >= MIN_OVERLAY_CONTRAST:
+            shifts.setdefault(o.camera, []).append(o.shift_px)
+    medians = {name: np.median(np.array(s), axis=0) for name, s in shifts.items()}
+    out["overlay_shift_px"] = {name: (float(m[0]), float(m[1])) for name, m in medians.items()}
+    return out
+
+
+def _figure_findings(figures: dict) -> list[Finding]:
+    found = []
+    median, coverage = figures["median_depth_m"], figures["depth_coverage"]
+    odd = not BODY_RANGE_M[0] <= median <= BODY_RANGE_M[1]
+    text = f"median {median:.2f} m, {coverage:.0%} of the pixels measured"
+    found.append(Finding("warning" if odd or coverage < 0.05 else "ok", "depth", text))
+    if "thermal_degC" in figures:
+        lo, mid, hi = figures["thermal_degC"]
+        text = f"{lo:.1f} to {hi:.1f} degC apparent (median {mid:.1f})"
+        found.append(Finding("ok" if hi < 60 and lo > 0 else "warning", "thermal", text))
+    if "seen_by_thermal" in figures:
+        seen = figures["seen_by_thermal"]
+        text = f"{seen:.0%} of the depth points lie in the thermal view"
+        found.append(Finding("ok" if seen > 0.2 else "warning", "view", text))
+    for name, (du, dv) in figures["overlay_shift_px"].items():
+        odd = np.hypot(du, dv) > MAX_OVERLAY_SHIFT_PX
+        text = f"depth edges fit the {name} image best when shifted by ({du:+.0f}, {dv:+.0f}) px"
+        found.append(Finding("warning" if odd else "ok", f"overlay {name}", text))
+    return found

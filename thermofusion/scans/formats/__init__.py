@@ -1,0 +1,1 @@
+"""Recordings of other makers, one format a file."""

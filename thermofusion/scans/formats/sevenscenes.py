@@ -1,0 +1,92 @@
+"""7-Scenes (Kinect v1) and 3DMatch folders: frame-NNNNNN.{color.png|jpg, depth.png, pose.txt}.
+
+Format: https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes/. Depth in millimetres, 0 or 65535
+invalid; camera-to-world poses of the depth camera in metres. Nothing is said there about colour's own calibration.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import ScanError
+from ...files.reading import read_numbers
+from ...files.tum import poses_to_trajectory
+from ...geometry.rigid import pose
+from ...types import Scan, Trajectory
+from ..common import frame_times, image_size, image_stream, make_camera, make_rig, numbered
+
+INVALID = (0, 65535)
+PUBLISHED_K = np.array([[585.0, 0, 320], [0, 585.0, 240], [0, 0, 1]])
+# The Kinect v1's colour camera is not calibrated in this data set: OpenNI's focal length and the mechanical baseline.
+COLOR_K = np.array([[525.0, 0, 320], [0, 525.0, 240], [0, 0, 1]])
+T_COLOR_DEPTH = pose(np.eye(3), np.array([-0.025, 0.0, 0.0]))
+
+
+def recognise(path: Path) -> bool:
+    """At least one frame-*.depth.png."""
+    return path.is_dir() and next(path.glob("frame-*.depth.png"), None) is not None
+
+
+def read(path: Path) -> Scan:
+    """Such a folder as a scan, with its poses; frames whose pose is not finite (tracking lost) go without one."""
+    depth = _frames(path, "depth")
+    if not depth:
+        raise ScanError("there are no frame-NNNNNN.depth.png", place=path)
+    numbers, files = [n for n, _ in depth], [f for _, f in depth]
+    width, height = image_size(files[0], "depth")
+    own = path / "camera-intrinsics.txt"
+    K = read_numbers(own, columns=3) if own.is_file() else PUBLISHED_K
+    camera = make_camera(width, height, K, place=own if own.is_file() else path)
+    notes = ["the recording carries no times: 30 frames a second by number are assumed"]
+    color_camera, color = None, None
+    color_frames = _frames(path, "color")
+    if color_frames:
+        color_camera = make_camera(*image_size(color_frames[0][1], "color"), COLOR_K, place=path)
+        color_numbers = [n for n, _ in color_frames]
+        color = image_stream(
+            "color",
+            [f for _, f in color_frames],
+            frame_times(color_numbers),
+            color_camera,
+            place=path,
+            index=color_numbers,
+        )
+        notes.append("colour is not calibrated here: nominal Kinect colour camera, 25 mm beside depth, assumed")
+    trajectory, lost = _poses(path, numbers)
+    if lost:
+        notes.append(f"{lost} frames have no finite pose")
+    return Scan(
+        name=path.resolve().name,
+        root=path,
+        format="7-scenes",
+        rig=make_rig(camera, color_camera, T_COLOR_DEPTH if color_camera is not None else None, place=path),
+        depth=image_stream("depth", files, frame_times(numbers), camera, place=path, index=numbers, invalid=INVALID),
+        color=color,
+        trajectory=trajectory,
+        notes=tuple(notes),
+    )
+
+
+def _frames(path: Path, kind: str) -> list[tuple[int, Path]]:
+    return numbered([f for s in ("png", "jpg") for f in path.glob(f"frame-*.{kind}.{s}")])
+
+
+def _poses(path: Path, numbers: list[int]) -> tuple[Trajectory | None, int]:
+    kept, poses, lost = [], [], 0
+    for n in numbers:
+        file = path / f"frame-{n:06d}.pose.txt"
+        if not file.is_file():
+            continue
+        T = read_numbers(file, columns=4)
+        if T.shape != (4, 4):
+            raise ScanError("expected a 4x4 matrix", place=file)
+        if np.isfinite(T).all():
+            kept.append(n)
+            poses.append(T)
+        else:
+            lost += 1
+    if not kept:
+        return None, lost
+    return poses_to_trajectory(frame_times(kept), np.array(poses), place=path), lost

@@ -1,0 +1,252 @@
+"""The schema of scan.json and rig.json, and its translation into the package's types: pydantic at the border."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, Field
+
+from ...errors import ScanError
+from ...files.strict import Border
+from ...types import BlackbodyReference, Camera, ContactReference, Reference, Rig, SignalCurve, ThermalSensor
+from ..common import Kind, make_camera, make_rig
+
+SCHEMA = "thermofusion-scan/1"
+STREAMS: tuple[Kind, ...] = ("depth", "color", "thermal")
+
+
+class CurveDoc(Border):
+    """`signal.curve`: counts to temperature."""
+
+    type: Literal["polynomial", "linear_kelvin", "planck", "table"]
+    coefficients_degC: list[float] | None = None
+    gain_K: float | None = None
+    offset_K: float | None = None
+    R: float | None = None
+    B: float | None = None
+    F: float | None = None
+    O: float | None = None  # noqa: E741 - the Planck curve's own letter
+    counts: list[float] | None = None
+    degC: list[float] | None = None
+
+
+class SignalDoc(Border):
+    """`signal`: what a stored thermal pixel is."""
+
+    kind: Literal["counts", "apparent_degC", "radiance"]
+    curve: CurveDoc | None = None
+
+
+class CameraDoc(Border):
+    """A camera."""
+
+    width_px: int = Field(gt=0, le=32767)
+    height_px: int = Field(gt=0, le=32767)
+    K: list[list[float]]
+    distortion: list[float] = Field(default_factory=list)
+    model: str | None = None
+    serial: str | None = None
+
+
+class DepthCameraDoc(CameraDoc):
+    """The depth camera."""
+
+    depth_unit_m: float = Field(0.001, gt=1e-6, le=0.1)
+    up: tuple[float, float, float] = (0.0, -1.0, 0.0)
+
+
+class ThermalCameraDoc(CameraDoc):
+    """The thermal camera."""
+
+    signal: SignalDoc
+    band_um: tuple[float, float] = (7.5, 13.5)
+    netd_K: float = Field(0.05, gt=0)
+    time_offset_s: float = Field(0.0, ge=-3600, le=3600)
+    psf_sigma_px: float | None = Field(None, gt=0)
+
+
+class CamerasDoc(Border):
+    """`cameras` of a scan."""
+
+    depth: DepthCameraDoc
+    color: CameraDoc | None = None
+    thermal: ThermalCameraDoc | None = None
+
+
+class ExtrinsicsDoc(Border):
+    """`extrinsics`: where the cameras sit."""
+
+    T_color_depth: list[list[float]] | None = None
+    T_thermal_depth: list[list[float]] | None = None
+
+
+class EnvironmentDoc(Border):
+    """`environment`: the room."""
+
+    reflected_degC: float | None = Field(None, gt=-100, lt=200)
+    air_degC: float | None = Field(None, gt=-100, lt=200)
+    relative_humidity_pct: float | None = Field(None, ge=0, le=100)
+
+
+class BlackbodyDoc(Border):
+    """A source of known temperature in some thermal frames."""
+
+    kind: Literal["blackbody"]
+    degC: float = Field(gt=-100, lt=1000)
+    uncertainty_K: float = Field(ge=0)
+    emissivity: float = Field(1.0, gt=0, le=1)
+    thermal_polygon_px: list[tuple[float, float]] = Field(min_length=3)
+    frames: list[int]
+
+
+class ContactDoc(Border):
+    """A thermometer on the skin."""
+
+    kind: Literal["contact"]
+    degC: float = Field(gt=-100, lt=1000)
+    uncertainty_K: float = Field(ge=0)
+    p_world_m: tuple[float, float, float]
+
+
+class ScanDoc(Border):
+    """scan.json."""
+
+    schema_: Literal["thermofusion-scan/1"] = Field(alias="schema")
+    name: str = "scan"
+    recorded_at: str | None = None
+    cameras: CamerasDoc
+    extrinsics: ExtrinsicsDoc = ExtrinsicsDoc()
+    environment: EnvironmentDoc = EnvironmentDoc()
+    references: list[Annotated[BlackbodyDoc | ContactDoc, Field(discriminator="kind")]] = Field(default_factory=list)
+    subject: dict[str, Any] = Field(default_factory=dict)
+    notes: list[str] = Field(default_factory=list)
+
+
+class RigThermalDoc(ThermalCameraDoc):
+    """The thermal camera of a rig.json: boards alone tell no curve."""
+
+    signal: SignalDoc | None = None  # type: ignore[assignment]
+
+
+class RigCamerasDoc(Border):
+    """`cameras` of a rig.json, each optional."""
+
+    depth: DepthCameraDoc | None = None
+    color: CameraDoc | None = None
+    thermal: RigThermalDoc | None = None
+
+
+class DepthCorrectionDoc(Border):
+    """What calibration found of the depth camera's own error (`calibration.depth_model`)."""
+
+    model: Literal["metric", "disparity"]
+    parameters: dict[str, float]
+
+
+class RigDoc(Border):
+    """rig.json: the `cameras` and `extrinsics` groups of a scan.json, each camera optional; the depth's correction."""
+
+    cameras: RigCamerasDoc
+    extrinsics: ExtrinsicsDoc = ExtrinsicsDoc()
+    depth_correction: DepthCorrectionDoc | None = None
+
+
+def camera_of(doc: CameraDoc, key: str, path: Path) -> Camera:
+    """A camera group as `Camera`."""
+    place = f"{path}: key '{key}'"
+    try:
+        K, distortion = np.array(doc.K, np.float64), np.array(doc.distortion, np.float64)
+    except ValueError:
+        raise ScanError("K must be a 3x3 matrix", place=place) from None
+    return make_camera(doc.width_px, doc.height_px, K, distortion, place=place)
+
+
+def rig_of(cameras: CamerasDoc, extrinsics: ExtrinsicsDoc, path: Path) -> Rig:
+    """The `cameras` and `extrinsics` groups as `Rig`."""
+    parts: dict[str, Any] = {"depth": camera_of(cameras.depth, "cameras.depth", path)}
+    for name in ("color", "thermal"):
+        doc, T = getattr(cameras, name), getattr(extrinsics, f"T_{name}_depth")
+        if doc is None:
+            continue
+        if T is None:
+            raise ScanError(f"key 'extrinsics.T_{name}_depth' is needed for the {name} camera", place=path)
+        parts[name] = camera_of(doc, f"cameras.{name}", path)
+        parts[f"T_{name}_depth"] = matrix_of(T, f"extrinsics.T_{name}_depth", path)
+    return make_rig(**parts, place=f"{path}: key 'extrinsics'")
+
+
+def matrix_of(rows: list[list[float]], key: str, path: Path) -> np.ndarray:
+    """A 4x4 matrix of a JSON list."""
+    if [len(r) for r in rows] != [4] * 4:
+        raise ScanError(f"key '{key}': expected a 4x4 matrix", place=path)
+    return np.array(rows, np.float64)
+
+
+_NEEDED = {
+    "polynomial": ("coefficients_degC",),
+    "linear_kelvin": ("gain_K", "offset_K"),
+    "planck": ("R", "B", "F", "O"),
+    "table": ("counts", "degC"),
+}
+
+
+def sensor_of(doc: ThermalCameraDoc, path: Path) -> ThermalSensor:
+    """The radiometric part of the thermal camera's group."""
+    lo, hi = doc.band_um
+    if not 1 <= lo < hi <= 30:
+        raise ScanError(
+            f"key 'cameras.thermal.band_um': expected two rising wavelengths in 1-30 um, got {lo}, {hi}", place=path
+        )
+    if doc.signal is None:  # of a rig.json
+        return ThermalSensor(SignalCurve(), doc.band_um, doc.netd_K, doc.time_offset_s, doc.psf_sigma_px)
+    signal = SignalCurve(doc.signal.kind)
+    if doc.signal.kind == "counts":
+        if doc.signal.curve is None:
+            raise ScanError("key 'cameras.thermal.signal.curve' is needed for counts", place=path)
+        signal = SignalCurve("counts", doc.signal.curve.type, _curve_parameters(doc.signal.curve, path))
+    return ThermalSensor(signal, doc.band_um, doc.netd_K, doc.time_offset_s, doc.psf_sigma_px)
+
+
+def _curve_parameters(doc: CurveDoc, path: Path) -> dict[str, tuple[float, ...]]:
+    """The curve's numbers, checked to be a curve that can be inverted."""
+    key = "cameras.thermal.signal.curve"
+    p: dict[str, tuple[float, ...]] = {}
+    for name in _NEEDED[doc.type]:
+        value = getattr(doc, name)
+        if value is None:
+            raise ScanError(f"key '{key}.{name}' is needed for a {doc.type} curve", place=path)
+        p[name] = tuple(value) if isinstance(value, list) else (float(value),)
+    if doc.type == "polynomial" and not any(p["coefficients_degC"][1:]):
+        raise ScanError(f"key '{key}.coefficients_degC': the temperature must depend on the counts", place=path)
+    if doc.type == "linear_kelvin" and p["gain_K"][0] == 0:
+        raise ScanError(f"key '{key}.gain_K' must not be 0", place=path)
+    if doc.type == "planck" and not (p["R"][0] > 0 and p["B"][0] > 0):
+        raise ScanError(f"key '{key}': R and B of a planck curve must be positive", place=path)
+    if doc.type == "table":
+        counts, degC = np.array(p["counts"]), np.array(p["degC"])
+        if len(counts) != len(degC) or len(counts) < 2:
+            raise ScanError(f"key '{key}': counts and degC must be two equally long lists, at least 2 each", place=path)
+        steps = np.diff(degC)
+        if not (np.diff(counts) > 0).all() or not ((steps > 0).all() or (steps < 0).all()):
+            raise ScanError(f"key '{key}': counts must rise strictly and degC must be monotone", place=path)
+    return p
+
+
+def reference_of(doc: BlackbodyDoc | ContactDoc) -> Reference:
+    """A reference group."""
+    if isinstance(doc, BlackbodyDoc):
+        polygon = np.array(doc.thermal_polygon_px, np.float64)
+        return BlackbodyReference(doc.degC, doc.uncertainty_K, doc.emissivity, polygon, tuple(doc.frames))
+    return ContactReference(doc.degC, doc.uncertainty_K, np.array(doc.p_world_m, np.float64))
+
+
+def unknown_keys(doc: BaseModel, prefix: str = "") -> list[str]:
+    """Keys that the schema does not know, dotted."""
+    keys = [prefix + k for k in (doc.model_extra or {})]
+    for name in type(doc).model_fields:
+        value = getattr(doc, name)
+        if isinstance(value, BaseModel):
+            keys += unknown_keys(value, f"{prefix}{name}.")
+    return keys

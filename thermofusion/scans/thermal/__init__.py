@@ -1,0 +1,1 @@
+"""Thermal files by themselves, without a depth recording beside them."""

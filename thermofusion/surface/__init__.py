@@ -1,0 +1,1 @@
+"""Depth frames with poses become one surface: `surface.fuse_surface`."""

@@ -1,0 +1,135 @@
+"""Depth frames with poses into the subject's surface: fuse, clean, normals, colour.
+
+The TSDF itself is `tsdf`, used only here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..geometry import mesh as meshing
+from ..geometry.camera import project
+from ..geometry.plane import find_floor, refine_floor
+from ..geometry.rigid import invert, transform_points
+from ..recipe import Recipe
+from ..types import Float, Float32, Int
+from .tsdf import (
+    GridPlan,
+    Survey,
+)
+
+SEEN_TRUNCATIONS = 2.0  # a vertex is on a frame's surface if nearer to it than this, in truncations
+VOTE_SHARE = 0.05  # of what a frame sees; less is a hand in front or a chair's leg
+MAX_PLANES = 3  # a floor and two walls
+
+
+@dataclass(frozen=True)
+class RemovedPart:
+    """Surface that was taken away: why, and how much."""
+
+    reason: str
+    area_cm2: float
+    pieces: int
+
+
+# ---------------------------------------------------------------- cleaning
+
+
+def _clean(
+    vertices: Float32, triangles: Int, survey: Survey, plan: GridPlan, recipe: Recipe, floor_plane: Float | None
+) -> tuple[Float32, Int, Float | None, tuple[RemovedPart, ...], tuple[str, ...]]:
+    """The subject's surface alone: without floor, background and specks."""
+    subject, removed, messages = recipe.subject, [], []
+    floor: Float | None = None
+    walls: list[Float] = []
+    if subject.floor != "keep":
+        floor, walls = _planes(vertices, triangles, survey, subject.floor_clearance_mm / 1e3, floor_plane)
+        if floor is None and subject.floor == "remove":
+            messages.append("no floor plane was found, none was removed")
+    planes = [("floor", floor)] if floor is not None else []
+    planes += [("wall", w) for w in walls] if subject.background == "remove" else []
+    for reason, plane in planes:
+        stays = _height(plane, vertices) >= subject.floor_clearance_mm / 1e3
+        removed.append(RemovedPart(reason, 1e4 * float(meshing.vertex_areas(vertices, triangles)[~stays].sum()), 1))
+        vertices, triangles = meshing.keep_vertices(vertices, triangles, stays)
+    vertices, triangles, others = _pieces(vertices, triangles, survey, plan, recipe)
+    return vertices, triangles, floor, (*removed, *others), tuple(messages)
+
+
+def _height(plane: Float, points: Float32) -> Float32:
+    return points @ plane[:3].astype(np.float32) + np.float32(plane[3])
+
+
+def _planes(
+    vertices: Float32, triangles: Int, survey: Survey, clearance_m: float, floor: Float | None
+) -> tuple[Float | None, list[Float]]:
+    """The floor (given or found), and other planes that bound the scene: walls.
+
+    Of several planes the floor is the one that faces up as the cameras were held.
+    """
+    areas, normals = meshing.vertex_areas(vertices, triangles), meshing.mesh_normals(vertices, triangles)
+    eyes, up = survey.T_world_depth[:, :3, 3], -survey.T_world_depth[:, :3, 1].mean(0)
+    found: list[Float] = []
+    if floor is not None:
+        floor = refine_floor(vertices, normals, areas, eyes, np.asarray(floor, np.float64))
+    plane = floor
+    for _ in range(MAX_PLANES):
+        if plane is None:
+            plane = find_floor(vertices, normals, areas, eyes)
+        if plane is None:
+            break
+        found.append(plane)
+        rest = _height(plane, vertices) >= clearance_m
+        vertices, normals, areas, plane = vertices[rest], normals[rest], areas[rest], None
+    if floor is None and found:
+        floor = max(found, key=lambda p: float(p[:3] @ up))
+    return floor, [p for p in found if p is not floor]
+
+
+def _pieces(
+    vertices: Float32, triangles: Int, survey: Survey, plan: GridPlan, recipe: Recipe
+) -> tuple[Float32, Int, tuple[RemovedPart, ...]]:
+    """The connected pieces that are the subject.
+
+    The subject is what the camera walked round: in most frames the nearest thing of some size. A wall may be larger and
+    fill more of the images, but stands behind. Where the background is kept, only specks go.
+    """
+    subject = recipe.subject
+    if len(triangles) == 0:
+        return vertices, triangles, ()
+    areas = meshing.vertex_areas(vertices, triangles)
+    label = meshing.components(triangles, len(vertices))
+    area_cm2 = 1e4 * np.bincount(label, areas)
+    large = area_cm2 >= subject.min_component_cm2
+    keep = large.copy()
+    if subject.background == "remove" and 0 < subject.keep_components < large.sum():
+        votes = _votes(vertices, areas, label, survey, plan)
+        ranked = np.flatnonzero(large)[np.argsort(-votes[large], kind="stable")]
+        keep[ranked[subject.keep_components :]] = False
+    removed = []
+    for reason, gone in (("beside the subject", large & ~keep), ("specks", ~large)):
+        if gone.any():
+            removed.append(RemovedPart(reason, float(area_cm2[gone].sum()), int(gone.sum())))
+    vertices, triangles = meshing.keep_vertices(vertices, triangles, keep[label])
+    return vertices, triangles, tuple(removed)
+
+
+def _votes(vertices: Float32, areas: Float, label: Int, survey: Survey, plan: GridPlan) -> Float:
+    """(pieces,) sampled frames in which a piece is the nearest that fills 5 % of what is seen; plus its mean share."""
+    (h, w), pieces = survey.camera.shape, int(label.max()) + 1
+    votes = np.zeros(pieces)
+    for depth, T in zip(survey.depth, survey.T_world_depth, strict=True):
+        uv, z = project(survey.camera, transform_points(invert(T), vertices))
+        u, v = (np.nan_to_num(np.rint(uv[:, i]), nan=-1.0) for i in range(2))
+        i = np.flatnonzero((u >= 0) & (u < w) & (v >= 0) & (v < h))
+        there = depth[v[i].astype(np.intp), u[i].astype(np.intp)]
+        i = i[np.abs(there - z[i]) < SEEN_TRUNCATIONS * plan.truncation_m]
+        angle = areas[i] / z[i] ** 2  # about the solid angle
+        share = np.bincount(label[i], angle, pieces) / max(angle.sum(), 1e-12)
+        if len(i):
+            z_mean = np.bincount(label[i], angle * z[i], pieces) / np.maximum(share * angle.sum(), 1e-12)
+            votes[np.where(share > VOTE_SHARE, z_mean, np.inf).argmin()] += 1
+        votes += share / (len(survey.depth) + 1)
+    return votes

@@ -1,0 +1,155 @@
+"""Depth frames with poses into the subject's surface: fuse, clean, normals, colour.
+
+The TSDF itself is `tsdf`, used only here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..depth.filter import DepthFrames
+from ..errors import ScanError
+from ..geometry import mesh as meshing
+from ..geometry.normals import window_normals
+from ..geometry.rigid import interpolate_trajectory
+from ..recipe import Recipe
+from ..types import Float, Scan, SurfaceMesh, Trajectory
+from .clean import RemovedPart, _clean
+from .color import color_vertices
+from .tsdf import (
+    BYTES_PER_BLOCK,
+    FramePoses,
+    Frames,
+    Progress,
+    integrate_frames,
+    plan_grid,
+    survey_depth,
+)
+
+SAME_TIME_S = 1e-3  # a pose this near in time is the frame's own
+PINHOLE_VOXELS = 14.0  # round a hole of two voxels' radius
+MAX_WALK_M = 100.0  # a camera path longer across than this is in another unit
+
+
+@dataclass(frozen=True, eq=False)
+class FusionResult:
+    """A fused surface and how it came about.
+
+    mesh : in world metres. voxel_m, truncation_m : of the grid. max_range_m : depth beyond it was not used.
+    noise_m_at_1m : depth noise estimated from the data, grows with range². blocks_estimated, blocks_used, memory_gib :
+    of the grid. floor_plane : (4,) `[n, d]`, n·p + d = height above the floor in metres; None = none found.
+    """
+
+    mesh: SurfaceMesh
+    voxel_m: float
+    truncation_m: float
+    max_range_m: float
+    noise_m_at_1m: float
+    blocks_estimated: int
+    blocks_used: int
+    memory_gib: float
+    frames_used: int
+    floor_plane: Float | None
+    removed: tuple[RemovedPart, ...]
+    messages: tuple[str, ...]
+
+
+def fuse_surface(
+    scan: Scan,
+    trajectory: Trajectory,
+    recipe: Recipe,
+    *,
+    progress: Progress | None = None,
+    floor_plane: Float | None = None,
+    frames: Frames | None = None,
+) -> FusionResult:
+    """Fuse a scan's depth frames into the surface of its subject.
+
+    Parameters
+    ----------
+    progress : called with ("surface", frames done, frames in all).
+    floor_plane : (4,) of an earlier stage, refined on the surface; None: looked for, as the recipe says.
+    frames : depth images, if not simply the scan's (e.g. with the background masked out).
+
+    Raises ScanError if no frame has a pose or no surface results, ResourceError if the grid cannot fit into memory.
+    """
+    frames = frames if frames is not None else DepthFrames(scan, recipe.input)
+    poses = depth_poses(scan, trajectory, recipe.input.max_pose_gap_ms / 1e3)
+    survey = survey_depth(scan, frames, poses)
+    plan = plan_grid(scan, survey, recipe)
+    grid, plan = integrate_frames(survey, frames, poses, plan, recipe, progress)
+    # A handful of views cannot see everything three times: a third of them is enough.
+    min_weight = min(recipe.fusion.min_weight, max(1, len(poses.frame) // 3))
+    vertices, triangles = grid.extract(min_weight)
+    if len(triangles) == 0:
+        raise ScanError(
+            f"{len(poses.frame)} depth frames made no surface: nothing was seen {min_weight:g} times",
+            place=scan.root,
+            hint="the trajectory must be T_world_depth in metres; `thermofusion check` shows the streams",
+        )
+    vertices, triangles = meshing.canonical(vertices, triangles)
+    vertices, triangles, plane, removed, notes = _clean(vertices, triangles, survey, plan, recipe, floor_plane)
+    if len(triangles) == 0:
+        raise ScanError(
+            "no surface is left after cleaning: " + ", ".join(f"{r.area_cm2:.0f} cm² {r.reason}" for r in removed),
+            place=scan.root,
+            hint="set subject.background = keep, or a smaller subject.min_component_cm2",
+        )
+    triangles = meshing.close_pinholes(vertices, triangles, PINHOLE_VOXELS * plan.voxel_m)
+    vertices = meshing.smooth_positions(vertices, triangles, recipe.fusion.smooth_iterations)
+    normals = window_normals(vertices, triangles, recipe.fusion.normal_window_mm / 1e3)
+    color = None
+    if recipe.fusion.color and scan.color is not None:
+        color = color_vertices(scan, trajectory, vertices, normals, recipe.input.max_pose_gap_ms / 1e3)
+    return FusionResult(
+        mesh=SurfaceMesh(vertices, triangles, normals, color),
+        voxel_m=plan.voxel_m,
+        truncation_m=plan.truncation_m,
+        max_range_m=plan.max_range_m,
+        noise_m_at_1m=survey.noise_m_at_1m,
+        blocks_estimated=plan.blocks,
+        blocks_used=grid.blocks,
+        memory_gib=grid.blocks * BYTES_PER_BLOCK / 2**30,
+        frames_used=len(poses.frame),
+        floor_plane=plane,
+        removed=removed,
+        messages=(*plan.messages, *notes),
+    )
+
+
+# ---------------------------------------------------------------- poses
+
+
+def depth_poses(scan: Scan, trajectory: Trajectory, max_gap_s: float) -> FramePoses:
+    """The depth frames a trajectory places.
+
+    A trajectory made from the depth frames holds their own times: then only frames with their own pose count, for one
+    without was lost by tracking. Any other trajectory (motion capture, robot arm) is interpolated.
+
+    Raises ScanError if no frame is placed, or the camera path is too long to be in metres.
+    """
+    times = scan.depth.times_s
+    near = np.clip(np.searchsorted(trajectory.times_s, times - SAME_TIME_S), 0, len(trajectory) - 1)
+    own = np.abs(trajectory.times_s[near] - times) <= SAME_TIME_S
+    if own.sum() >= 0.5 * len(trajectory):
+        T, valid = trajectory.T_world_depth[near], own
+    else:
+        T, valid = interpolate_trajectory(trajectory, times, max_gap_s=max_gap_s)
+        T[own] = trajectory.T_world_depth[near[own]]
+        valid = valid | own
+    valid = valid & scan.depth.usable
+    if not valid.any():
+        raise ScanError(
+            f"none of {len(times)} depth frames has a pose: depth runs {times[0]:.3f} to {times[-1]:.3f} s, "
+            f"the trajectory {trajectory.times_s[0]:.3f} to {trajectory.times_s[-1]:.3f} s",
+            place=scan.root,
+            hint="both must use the depth camera's clock",
+        )
+    walk = np.ptp(T[valid][:, :3, 3], axis=0).max()
+    if walk > MAX_WALK_M:
+        raise ScanError(
+            f"the camera path is {walk:.0f} m across", place=scan.root, hint="the trajectory must be in metres"
+        )
+    return FramePoses(np.flatnonzero(valid), T[valid])

@@ -1,0 +1,1 @@
+"""Observations become the true temperature of every vertex, with its uncertainty."""

@@ -1,0 +1,349 @@
+"""Many observations of a vertex into one temperature: weights, methods, fallbacks.
+
+Everything is added up in radiance; one inversion at the end. Method `joint` works on cross-calibrated observations with
+inverse-variance weights and a robust loss; the others are what the field does, kept for comparison.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..physics.band import ZERO_DEGC_K, Band
+from ..physics.emissivity import EmissivityModel, follows_shape
+from ..physics.equation import leaving_radiance, paper_chain
+from ..recipe import RadiometrySection
+from ..types import Bool, Float, Float32, Int, Observations, OutputMode
+from .crosscal import CrosscalResult
+from .mean import Groups, RobustMean
+from .uncertainty import (
+    AngleTables,
+    ErrorModel,
+    Levers,
+    Uncertainty,
+    observation_variance,
+    registration_m,
+    silhouette_share,
+    skin_slope,
+    vertex_uncertainty,
+)
+
+THREADS = 2
+BLOCK = 1_500_000  # rows worked on at once by each thread: bounds memory whatever the scan
+MODES = 10  # of the calibration's covariance that are followed to each vertex
+FACING_DEG = 15.0  # what counts as straight on for the paper's S
+
+
+@dataclass(frozen=True, eq=False)
+class BlendResult:
+    """Temperatures of V vertices; NaN = no observation counts.
+
+    absolute_K, normal_equivalent_K, apparent_K : (V,) float64. uncertainty : one sigma of `output`, with its parts.
+    count : (V,) int32 observations that count. oblique : (V,) nothing straighter than the limit saw it.
+    best_angle_deg : (V,) float32 of the straightest one; distance_m : its range. residual : (V,) float32, rms of the
+    views about the vertex in sigmas of their own errors (1 = as expected; NaN for one view). spread_K : the same in K.
+    """
+
+    output: OutputMode
+    absolute_K: Float
+    normal_equivalent_K: Float
+    apparent_K: Float
+    uncertainty: Uncertainty
+    count: Int
+    oblique: Bool
+    best_angle_deg: Float32
+    distance_m: Float32
+    residual: Float32
+    spread_K: Float32
+
+    @property
+    def temperature_K(self) -> Float:
+        """(V,) in the sense of `output`."""
+        return {
+            "absolute": self.absolute_K,
+            "normal-equivalent": self.normal_equivalent_K,
+            "apparent": self.apparent_K,
+        }[self.output]
+
+
+def remove_air_path(observations: Observations, transmission_per_m: float, L_air: float) -> Observations:
+    """Observations with the air between surface and camera removed: L = (L' - (1-τ) L_air)/τ, τ = τ₁^range."""
+    if transmission_per_m == 1.0:
+        return observations
+    tau = np.float32(transmission_per_m) ** observations.range_m
+    columns = {k: getattr(observations, k) for k in observations.__dataclass_fields__}
+    columns["radiance"] = leaving_radiance(observations.radiance, transmission=tau, L_air=L_air).astype(np.float32)
+    return Observations(**columns)
+
+
+def blend(
+    observations: Observations,
+    n_vertices: int,
+    calibration: CrosscalResult | None,
+    emissivity: EmissivityModel,
+    band: Band,
+    *,
+    L_reflected: float | NDArray,
+    reflected_K: float,
+    air_K: float | None = None,
+    settings: RadiometrySection | None = None,
+    errors: ErrorModel | None = None,
+    max_angle_deg: float = 65.0,
+    last_resort_angle_deg: float = 75.0,
+    with_uncertainty: bool = True,
+) -> BlendResult:
+    """One temperature per vertex from all observations of it.
+
+    Parameters
+    ----------
+    observations : sorted by (view, vertex); radiance as the camera reports it, freed of the air path.
+    calibration : used by method `joint` only; its shape of ε(θ) replaces the model's.
+    emissivity : the recipe's model. L_reflected : radiance reflected by vertices, scalar or (V,).
+    reflected_K : temperature of the room's reflection (the paper's T_a). air_K : of the air, for the budget.
+    with_uncertainty : False for a first round whose temperatures only feed the next: no budget, NaN.
+    """
+    settings, errors = settings or RadiometrySection(), errors or ErrorModel()
+    calibration = calibration if settings.method == "joint" else None
+    task = _Task(
+        calibration=calibration,
+        given=emissivity,
+        model=calibration.emissivity(emissivity) if calibration else emissivity,
+        band=band,
+        reflected_K=reflected_K,
+        air_K=air_K,
+        settings=settings,
+        slope_L=calibration.slope_L if calibration else skin_slope(band, observations.radiance),
+        paper_S=_paper_scale(observations, emissivity, band, reflected_K) if settings.method == "paper" else 1.0,
+        distance_m=float(np.median(observations.range_m)) if len(observations) else 0.0,
+        with_uncertainty=with_uncertainty,
+    )
+    usable, oblique = _usable(observations, n_vertices, max_angle_deg, max(last_resort_angle_deg, max_angle_deg))
+    L_r = np.broadcast_to(np.asarray(L_reflected, np.float64), (n_vertices,))
+    gradient = np.broadcast_to(np.asarray(errors.gradient_K_per_m, np.float32), (n_vertices,))
+
+    def block(edges: tuple[int, int]) -> _Block:
+        lo, hi = edges
+        mine = np.flatnonzero(usable & (observations.vertex >= lo) & (observations.vertex < hi))
+        groups, order = Groups.by_vertex(observations.vertex[mine] - np.int32(lo), hi - lo)
+        groups = replace(groups, vertex=groups.vertex + np.int32(lo))
+        rows = observations.select(mine[order])
+        local = replace(errors, gradient_K_per_m=gradient[groups.vertex])
+        return _blend(
+            replace(rows, vertex=groups.rows(np.arange(len(groups), dtype=np.int32))), groups, L_r, task, local
+        )
+
+    rounds = max(1, -(-len(observations) // (THREADS * BLOCK)))  # whole rounds: no thread waits for the other
+    edges = np.linspace(0, n_vertices, THREADS * rounds + 1).astype(int).tolist()
+    with ThreadPoolExecutor(max_workers=THREADS) as pool:
+        return _assembled(list(pool.map(block, pairwise(edges))), oblique, n_vertices, task)
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """What a blend needs besides observations: the same for all blocks of vertices."""
+
+    calibration: CrosscalResult | None
+    given: EmissivityModel  # the recipe's
+    model: EmissivityModel  # with the fitted shape
+    band: Band
+    reflected_K: float
+    air_K: float | None
+    settings: RadiometrySection
+    slope_L: float
+    paper_S: float
+    distance_m: float  # typical
+    with_uncertainty: bool
+
+    @property
+    def angle_corrected(self) -> bool:
+        return self.settings.method in ("joint", "corrected-cos")
+
+    @property
+    def epsilon0(self) -> float:
+        """1 where nothing is corrected."""
+        return self.model.normal if self.angle_corrected else 1.0
+
+    @cached_property
+    def tables(self) -> AngleTables:
+        return AngleTables.of(self.model)
+
+
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """The blend of the vertices of one block that were seen: columns (G,) by name, errors apart."""
+
+    vertex: Int
+    columns: dict[str, NDArray]
+    parts_K: dict[str, NDArray]
+    common_K: dict[str, NDArray]
+
+
+def _blend(rows: Observations, groups: Groups, L_r: Float, task: _Task, errors: ErrorModel) -> _Block:
+    """Blend rows that are grouped by vertex; their vertices are numbered by group."""
+    method, band, L_r = task.settings.method, task.band, L_r[groups.vertex]
+    best = groups.least(-rows.cos_angle)
+    resolution = 1 / rows.footprint_m2
+    apparent = groups.sums(resolution * rows.radiance) / groups.sums(resolution)
+    columns = {
+        "count": groups.count,
+        "best_angle_deg": np.degrees(np.arccos(np.clip(rows.cos_angle[best], -1, 1))),
+        "distance_m": rows.range_m[best],
+        "apparent_K": band.temperature_K(apparent),
+    }
+    parts: dict[str, NDArray] = {}
+    common: dict[str, NDArray] = {}
+    if method in ("nearest-view", "paper"):
+        pick = groups.least(rows.range_m) if method == "nearest-view" else best
+        L0 = L_s = _single(rows.select(pick), task)
+        parts = {"noise": np.full(len(groups), errors.netd_K)}
+    else:
+        mean = _robust_mean(rows, groups, L_r, task, errors)
+        scale = task.calibration.residual_sigma if task.calibration and mean.statistical else None
+        x = mean.solve(robust=method == "joint", scale=scale)
+        L0, L_s = L_r + x, L_r + x / task.epsilon0
+        columns["residual"], spread = mean.scatter(x)
+        columns["spread_K"] = spread / task.slope_L
+        if task.with_uncertainty:
+            parts, common = _errors_of(rows, mean, x, band.temperature_K(L_s), columns, task, errors)
+    columns |= {"absolute_K": band.temperature_K(L_s), "normal_equivalent_K": band.temperature_K(L0)}
+    return _Block(groups.vertex, columns, parts, common)
+
+
+def _errors_of(
+    rows: Observations,
+    mean: RobustMean,
+    x: Float,
+    T_K: Float,
+    columns: dict[str, NDArray],
+    task: _Task,
+    errors: ErrorModel,
+) -> tuple[dict[str, NDArray], dict[str, NDArray]]:
+    calibration = task.calibration
+    fitted = calibration is not None and calibration.shape_sigma > 0
+    return vertex_uncertainty(
+        _levers(rows, mean, x, task, errors),
+        x,
+        T_K,
+        epsilon0=task.epsilon0,
+        absolute=task.settings.output == "absolute" and task.angle_corrected,
+        slope_L=task.slope_L,
+        slope_reflected=float(task.band.d_radiance_dT(task.reflected_K)),
+        errors=errors,
+        shape_fitted=fitted,
+        epsilon0_follows=fitted and follows_shape(task.given),
+        reference_sigma_K=calibration.reference_sigma_K if calibration else np.nan,
+        air_K=task.air_K,
+        transmission_per_m=task.settings.transmission_per_m,
+        path_m=columns["distance_m"] - task.distance_m,
+        views_K=None if calibration else columns["spread_K"],
+    )
+
+
+def _assembled(blocks: list[_Block], oblique: Bool, n_vertices: int, task: _Task) -> BlendResult:
+    """Blocks put into arrays of all vertices: NaN, and count 0, where none was seen."""
+    vertex = np.concatenate([b.vertex for b in blocks])
+
+    def whole(pieces: list[NDArray], dtype: type) -> NDArray:
+        out: NDArray = np.full(n_vertices, 0 if dtype is np.int32 else np.nan, dtype)
+        out[vertex] = np.concatenate(pieces)
+        return out
+
+    def column(name: str, dtype: type = np.float64) -> NDArray:
+        nan = [np.full(len(b.vertex), np.nan) for b in blocks]
+        return whole([b.columns.get(name, n) for b, n in zip(blocks, nan, strict=True)], dtype)
+
+    parts = {k: whole([b.parts_K[k] for b in blocks], np.float32) for k in blocks[0].parts_K}
+    common = {k: whole([b.common_K[k] for b in blocks], np.float32) for k in blocks[0].common_K}
+    return BlendResult(
+        output=task.settings.output,
+        absolute_K=column("absolute_K"),
+        normal_equivalent_K=column("normal_equivalent_K"),
+        apparent_K=column("apparent_K"),
+        uncertainty=Uncertainty.of(parts or {"noise": np.full(n_vertices, np.nan)}, common),
+        count=column("count", np.int32),
+        oblique=oblique,
+        best_angle_deg=column("best_angle_deg", np.float32),
+        distance_m=column("distance_m", np.float32),
+        residual=column("residual", np.float32),
+        spread_K=column("spread_K", np.float32),
+    )
+
+
+# ---------------------------------------------------------------- which observations count
+
+
+def _usable(
+    observations: Observations, n_vertices: int, max_angle_deg: float, last_resort_angle_deg: float
+) -> tuple[Bool, Bool]:
+    """(rows that count, vertices that only oblique rows saw)."""
+    measured = np.isfinite(observations.radiance)
+    good = measured & (observations.cos_angle >= np.float32(np.cos(np.radians(max_angle_deg))))
+    well_seen = np.zeros(n_vertices, bool)
+    well_seen[observations.vertex[good]] = True
+    last = measured & (observations.cos_angle >= np.float32(np.cos(np.radians(last_resort_angle_deg)))) & ~good
+    last &= ~well_seen[observations.vertex]
+    oblique = np.zeros(n_vertices, bool)
+    oblique[observations.vertex[last]] = True
+    return good | last, oblique
+
+
+def _single(rows: Observations, task: _Task) -> Float:
+    """Radiance of one row a vertex: raw, or for method `paper` Eqs. 24-27 in degrees Celsius, as radiance again."""
+    L = rows.radiance.astype(np.float64)
+    if task.settings.method == "nearest-view":
+        return L
+    degC, ambient = task.band.temperature_K(L) - ZERO_DEGC_K, task.reflected_K - ZERO_DEGC_K
+    epsilon = task.given(rows.cos_angle.astype(np.float64))
+    _, scaled = paper_chain(degC, epsilon, ambient, S=task.paper_S)
+    return task.band.radiance(scaled + ZERO_DEGC_K)
+
+
+def _paper_scale(rows: Observations, emissivity: EmissivityModel, band: Band, reflected_K: float) -> float:
+    """The paper's S (Eq. 26): measured over corrected temperature, °C, where the surface faces the camera."""
+    facing = np.flatnonzero(rows.cos_angle >= min(np.cos(np.radians(FACING_DEG)), rows.cos_angle.max(initial=0)))
+    facing = facing[np.isfinite(rows.radiance[facing])][:: max(1, len(facing) // 100_000)]
+    if not len(facing):
+        return 1.0
+    degC = band.temperature_K(rows.radiance[facing].astype(np.float64)) - ZERO_DEGC_K
+    corrected, _ = paper_chain(degC, emissivity(rows.cos_angle[facing].astype(np.float64)), reflected_K - ZERO_DEGC_K)
+    return float(np.median(degC) / np.median(corrected))
+
+
+# ---------------------------------------------------------------- weighted means
+
+
+def _robust_mean(rows: Observations, groups: Groups, L_r: Float, task: _Task, errors: ErrorModel) -> RobustMean:
+    """Rows y = E·x with the method's weights."""
+    y = (task.calibration.corrected(rows) if task.calibration else rows.radiance) - groups.rows(L_r)
+    E = task.tables.relative(rows.cos_angle) if task.angle_corrected else np.ones(len(rows))
+    method = task.settings.method
+    statistical = method == "joint" and task.settings.weight == "inverse-variance"
+    if statistical:
+        excess = groups.rows((groups.sums(y) / groups.count).astype(np.float32))
+        weight = np.float32(1) / observation_variance(rows, excess, task.tables, errors, task.slope_L)
+    elif method == "mean":
+        weight = np.ones(len(rows), np.float32)
+    else:  # resolution: pixels per surface, proportional to cosθ/d²
+        weight = np.float32(1e-6) / rows.footprint_m2
+    weight = np.asarray(weight, np.float32)
+    return RobustMean(groups, np.asarray(y), E, weight, weight.copy(), statistical)
+
+
+def _levers(rows: Observations, mean: RobustMean, x: Float, task: _Task, errors: ErrorModel) -> Levers:
+    """Σ over each vertex's rows of h times what an error does to a row, h = wE/ΣwE²."""
+    groups, one = mean.groups, np.ones(len(rows), np.float32)
+    h = (mean.robust * mean.E / groups.rows(mean.denominator(mean.robust))).astype(np.float32)
+    slope = task.tables.slope(rows.cos_angle) if task.angle_corrected else 0 * one
+    loss, mixed = (1 - mean.E).astype(np.float32), silhouette_share(rows.edge_px, errors)
+    block = np.stack([one, loss, slope, registration_m(rows, errors), mixed], axis=1)
+    sums = groups.weighted_sums(h, block)
+    squares = groups.weighted_sums(h * h, np.stack([one, slope * slope], axis=1))
+    modes = np.zeros((len(groups), 0))
+    if task.calibration:
+        modes = groups.weighted_sums(h, task.calibration.error_modes(MODES)(rows, groups.rows(x.astype(np.float32))))
+    return Levers(squares[:, 0], sums[:, 0], sums[:, 1], sums[:, 2], squares[:, 1], sums[:, 3], sums[:, 4], modes)

@@ -1,0 +1,398 @@
+"""Overlapping views calibrate each other: one offset per view, one field over the image, one shape of ε(θ).
+
+What one view saw obliquely another saw straight on. With x_v the normal-equivalent radiance of vertex v above what it
+reflects, an observation of it by view i at pixel (u, v) is
+
+    L' = L + γ·(L - L_pivot) + b_i + φ(u, v) + noise,      L = L_r + (E(θ) + s·D(θ))·x_v,      E = ε(θ)/ε(0),
+
+so that ε(0) plays no part. All x_v are eliminated, which leaves a small system (`overlap`). The common level is no
+matter of overlap: it is imposed as a hard constraint (blackbodies, a contact thermometer, else Σ b = 0 and the result
+is relative). See docs/radiometry.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+
+from ..errors import ScanError
+from ..mapping.references import BlackbodyReading, ContactReading
+from ..physics.band import Band
+from ..physics.emissivity import AngleTable, EmissivityModel, reshaped, shape_direction
+from ..recipe import CrosscalSection
+from ..types import Bool, Float, Float32, Observations
+from .field import ImageField
+from .system import SHAPE_BOUNDS, ContactRow, KnownField, OverlapSystem, Solution, condition_number
+from .uncertainty import AngleTables, ErrorModel, covariance_modes, observation_variance, skin_slope
+
+FIELD_HELD = 0.7  # of the prior's sigma: a pattern of the field less certain than this is held at zero
+SHAPE_HELD = 0.5  # a shape less certain than half the way between the skin presets is held
+GAIN_SPAN_K = 3.0  # references must differ by this much to carry a gain
+ROWS_PER_VERTEX = 20  # bound on the system: max_vertices x this many observations
+SUPPORT_CELLS = 24  # across the image; the field is known in those that hold so many rows of so many views
+SUPPORT_ROWS, SUPPORT_VIEWS = 25, 3
+MIN_SHARED = 20  # vertices that two views must share to count as overlapping
+ERROR_RASTER = 32  # cells along each side on which the field's error is evaluated
+
+
+@dataclass(frozen=True, eq=False)
+class CrosscalResult:
+    """What the overlap of views settled. Radiances in W m-2 sr-1; `slope_L` (dL/dT) turns them into K.
+
+    offset_radiance : (N_views,) b. field : φ(u, v). shape, shape_sigma : s of `emissivity.reshaped`. gain : 1 + γ about
+    `pivot_radiance`. covariance : (P, P) of [offsets, field coefficients, s, γ] at a given level, held ones zero.
+    anchored : a reference set the level, with the uncertainty reference_sigma_K; level_sigma_K adds how the views hang
+    on it. Both are NaN for a relative result. residual_sigma : robust scale of residuals over their predicted σ.
+    view_rms_K : (N_views,) weighted residual. outlier_fraction : share of observations left without weight.
+    condition : of the offsets on what overlap can see. held : parameters asked for that the data cannot carry.
+    messages : what a user should know.
+    """
+
+    offset_radiance: Float
+    field: ImageField
+    shape: float
+    shape_sigma: float
+    gain: float
+    pivot_radiance: float
+    covariance: Float
+    slope_L: float
+    anchored: bool
+    reference_sigma_K: float
+    level_sigma_K: float
+    residual_sigma: float
+    view_rms_K: Float
+    outlier_fraction: float
+    condition: float
+    held: tuple[str, ...]
+    iterations: int
+    converged: bool
+    messages: tuple[str, ...]
+
+    @property
+    def offsets_K(self) -> Float:
+        """(N_views,) offsets as temperatures at skin level."""
+        return self.offset_radiance / self.slope_L
+
+    def emissivity(self, model: EmissivityModel) -> EmissivityModel:
+        """The model with the fitted shape (and its ε(0), see `emissivity.reshaped`)."""
+        return reshaped(model, self.shape)
+
+    def corrected(self, observations: Observations) -> Float:
+        """Radiance of observations with the camera's offset, field and gain removed, (N,) float64."""
+        L = observations.radiance.astype(np.float64)
+        camera = self.offset_radiance[observations.view]
+        if np.any(self.field.coefficients):
+            camera = camera + self.field(observations.u_px, observations.v_px)
+        return np.asarray((L - camera + (self.gain - 1) * self.pivot_radiance) / self.gain)
+
+    def error_modes(self, count: int) -> Callable[[Observations, NDArray], Float32]:
+        """How the strongest error modes of this calibration shift observations: (rows, x of rows) -> (N, count)."""
+        modes = covariance_modes(self.covariance, count).astype(np.float32)
+        M, n = len(self.offset_radiance), ERROR_RASTER
+        du, dv = self.field.width_px / n, self.field.height_px / n
+        v, u = (np.mgrid[0:n, 0:n].reshape(2, -1) + 0.5) * np.array([[dv], [du]])
+        raster = (self.field.patterns(u, v) @ modes[M:-2]).astype(np.float32)
+        direction = AngleTable.of(shape_direction(AngleTable.knots()))
+
+        def effect(rows: Observations, x: NDArray) -> Float32:
+            cell = (rows.v_px / np.float32(dv)).astype(np.int32) * n + (rows.u_px / np.float32(du)).astype(np.int32)
+            out = modes[rows.view] + raster[np.clip(cell, 0, n * n - 1)]
+            return np.asarray(out + (x * direction(rows.cos_angle))[:, None].astype(np.float32) * modes[-2])
+
+        return effect
+
+
+def cross_calibrate(
+    observations: Observations,
+    n_vertices: int,
+    n_views: int,
+    emissivity: EmissivityModel,
+    band: Band,
+    *,
+    image_size: tuple[int, int],
+    L_reflected: float | NDArray,
+    errors: ErrorModel | None = None,
+    settings: CrosscalSection | None = None,
+    max_angle_deg: float = 65.0,
+    blackbodies: Sequence[BlackbodyReading] = (),
+    contacts: Sequence[ContactReading] = (),
+    vertices_per_patch: float = 1.0,
+) -> CrosscalResult:
+    """Solve for offsets, field, shape and gain from all vertices that two or more views saw.
+
+    Parameters
+    ----------
+    observations : sorted by (view, vertex); radiance freed of the air path. image_size : (width, height) px.
+    L_reflected : radiance that vertices reflect, scalar or (V,). errors : one-sigma parts that weight observations.
+    settings : `offsets = false` is one offset common to all views. max_angle_deg : steeper observations do not enter.
+    blackbodies : readings; they set the level together. contacts : set the level where no blackbody does.
+    vertices_per_patch : how many neighbouring vertices share their error (one window of normals, say). A million rows
+    are not a million witnesses: without it, noise is taken for a field wherever the image shows no skin.
+
+    Raises ScanError if no vertex was seen by two views.
+    """
+    errors, settings = errors or ErrorModel(), settings or CrosscalSection()
+    chosen = _choose(observations, n_vertices, settings.max_vertices, max_angle_deg, contacts)
+    L_r = np.broadcast_to(np.asarray(L_reflected, np.float64), (n_vertices,))
+    system = _system(chosen, n_views, emissivity, band, image_size, L_r, errors, settings, blackbodies, contacts)
+    seen = max(int((np.bincount(observations.vertex, minlength=n_vertices) >= 2).sum()), 1)
+    system = replace(system, correlated=max(1.0, vertices_per_patch * system.n_vertices / seen))
+    solution = system.solve()
+    reduced, held = _without_uncarried(system, solution)
+    if settings.gain and not system.use_gain:
+        held = ("gain", *held)
+    if reduced is not system:
+        system, solution = reduced, reduced.solve()
+    group = np.arange(n_views) if settings.offsets else np.zeros(n_views, np.intp)
+    return _result(system, solution, group, chosen, held, _shape_bias(system, emissivity, errors))
+
+
+def _choose(
+    observations: Observations,
+    n_vertices: int,
+    max_vertices: int,
+    max_angle_deg: float,
+    contacts: Sequence[ContactReading],
+) -> Observations:
+    """Observations under the angle limit of an even sample of the vertices that two or more views saw."""
+    usable = observations.cos_angle >= np.float32(np.cos(np.radians(max_angle_deg)))
+    usable &= np.isfinite(observations.radiance)
+    count = np.bincount(observations.vertex[usable], minlength=n_vertices)
+    shared = np.flatnonzero(count >= 2)
+    if not len(shared):
+        raise ScanError(
+            "no spot of the surface was seen well by two thermal views",
+            hint="cross-calibration needs overlap: choose another radiometry.method",
+        )
+    stride = max(-(-len(shared) // max_vertices), -(-int(count[shared].sum()) // (max_vertices * ROWS_PER_VERTEX)))
+    wanted = np.zeros(n_vertices, bool)
+    wanted[shared[::stride]] = True
+    for contact in contacts:
+        wanted[contact.vertices] = True
+    return observations.select(usable & wanted[observations.vertex])
+
+
+def _system(
+    rows: Observations,
+    n_views: int,
+    emissivity: EmissivityModel,
+    band: Band,
+    image_size: tuple[int, int],
+    L_r: Float,
+    errors: ErrorModel,
+    settings: CrosscalSection,
+    blackbodies: Sequence[BlackbodyReading],
+    contacts: Sequence[ContactReading],
+) -> OverlapSystem:
+    """Columns of the least squares system."""
+    numbers, vertex = np.unique(rows.vertex, return_inverse=True)
+    order = np.argsort(vertex, kind="stable").astype(np.int32)
+    count = np.bincount(vertex)
+    L, cos, tables = rows.radiance.astype(np.float64), rows.cos_angle, AngleTables.of(emissivity)
+    y = L - L_r[rows.vertex]
+    # weights must not depend on the camera's common offset: what references say of it is taken off first
+    contact_rows = _contact_rows(contacts, numbers, L_r, emissivity.normal)
+    common = _common_offset(np.bincount(vertex, y) / count, blackbodies, contact_rows)
+    slope_L = skin_slope(band, L - common)
+    excess = (np.bincount(vertex, y - common) / count)[vertex]
+    field = ImageField.zero(*image_size)
+    K = len(field.coefficients) if settings.vignetting else 0
+    expected = np.array([r.expected for r in blackbodies])
+    use_gain = settings.gain and len(expected) > 1 and float(np.ptp(expected)) >= GAIN_SPAN_K * slope_L
+    pivot = float(expected.mean()) if len(expected) else 0.0
+    columns = np.zeros((len(rows), K + 2))
+    columns[:, :K] = field.patterns(rows.u_px, rows.v_px)[:, :K]
+    columns[:, -1] = L_r[rows.vertex] - pivot if use_gain else 0.0  # what (1+γ)x leaves of γ
+    return OverlapSystem(
+        vertex=vertex.astype(np.int32),
+        group=rows.view if settings.offsets else np.zeros(len(rows), np.int32),
+        y=y,
+        E=tables.relative(cos),
+        D=AngleTable.of(shape_direction(AngleTable.knots()), np.float64)(cos),
+        sigma2=observation_variance(rows, excess, tables, errors, slope_L).astype(np.float64),
+        columns=columns,
+        order=order,
+        start=np.insert(np.cumsum(count), 0, 0).astype(np.int32),
+        n_groups=n_views if settings.offsets else 1,
+        field=field,
+        keep=np.eye(len(field.coefficients))[:, :K],
+        use_shape=settings.shape,
+        use_gain=use_gain,
+        slope_L=slope_L,
+        pivot=pivot,
+        readings=tuple(blackbodies),
+        reading_groups=tuple(r.view if settings.offsets else 0 for r in blackbodies),
+        contacts=tuple(contact_rows),
+        reading_places=_known_fields(rows, blackbodies, image_size) if blackbodies else (),
+    )
+
+
+def _known_fields(
+    rows: Observations, readings: Sequence[BlackbodyReading], image_size: tuple[int, int]
+) -> tuple[KnownField, ...]:
+    """For each reading the nearest place at which skin was seen, so that the field is known: its own, mostly."""
+    width, height = image_size
+    side = width / SUPPORT_CELLS
+    across, down = SUPPORT_CELLS, int(np.ceil(height / side))
+    cell = np.clip((rows.v_px / side).astype(np.int64), 0, down - 1) * across
+    cell += np.clip((rows.u_px / side).astype(np.int64), 0, across - 1)
+    n_views = int(rows.view.max(initial=0)) + 1
+    seen = np.bincount(cell * n_views + rows.view, minlength=across * down * n_views).reshape(-1, n_views)
+    good = (seen.sum(axis=1) >= SUPPORT_ROWS) & ((seen > 0).sum(axis=1) >= SUPPORT_VIEWS)
+    v, u = np.divmod(np.flatnonzero(good), across)
+
+    def nearest(reading: BlackbodyReading) -> KnownField:
+        if not len(u):
+            return KnownField(reading.u_px, reading.v_px, np.inf)
+        du = np.clip(reading.u_px, u * side, (u + 1) * side) - reading.u_px
+        dv = np.clip(reading.v_px, v * side, (v + 1) * side) - reading.v_px
+        distance = np.hypot(du, dv)
+        k = int(np.argmin(distance))
+        return KnownField(reading.u_px + float(du[k]), reading.v_px + float(dv[k]), float(distance[k]) / width)
+
+    return tuple(nearest(r) for r in readings)
+
+
+def _contact_rows(
+    contacts: Sequence[ContactReading], numbers: NDArray, L_r: Float, epsilon0: float
+) -> list[ContactRow]:
+    """Contact readings in the system's numbering, as the normal-equivalent excess x = ε(0)(L_s - L_r)."""
+    out = []
+    for contact in contacts:
+        known = contact.vertices[np.isin(contact.vertices, numbers)]
+        if len(known):
+            expected = epsilon0 * (contact.expected - float(L_r[known].mean()))
+            local = np.searchsorted(numbers, known).astype(np.int32)
+            out.append(ContactRow(local, expected, epsilon0 * contact.sigma_expected))
+    return out
+
+
+def _common_offset(y_mean: Float, blackbodies: Sequence[BlackbodyReading], contacts: Sequence[ContactRow]) -> float:
+    """A first guess of the offset common to all views; 0 without a reference."""
+    if blackbodies:
+        return float(np.mean([r.measured - r.expected for r in blackbodies]))
+    if contacts:
+        return float(np.mean([y_mean[c.vertices].mean() - c.expected for c in contacts]))
+    return 0.0
+
+
+# ---------------------------------------------------------------- what the data carry
+
+
+def _without_uncarried(system: OverlapSystem, solution: Solution) -> tuple[OverlapSystem, tuple[str, ...]]:
+    """The system without the parameters whose own uncertainty says that the overlap does not carry them."""
+    M, K, _ = system.sizes
+    held, keep, use_shape = [], system.keep, system.use_shape
+    if K:
+        # in units of what was known before: a combination of patterns that the data tell nothing of keeps a sigma of 1
+        prior = np.sqrt(1 / np.diag(system.field_prior()))
+        values, vectors = np.linalg.eigh(solution.covariance[M : M + K, M : M + K] / np.outer(prior, prior))
+        carried = np.sqrt(np.maximum(values, 0)) < FIELD_HELD
+        if not carried.all():
+            keep = keep @ (prior[:, None] / prior.max() * vectors[:, carried])
+            held.append(f"{int((~carried).sum())} of {K} field patterns")
+    if use_shape and np.sqrt(solution.covariance[M + K, M + K]) > SHAPE_HELD:
+        use_shape = False
+        held.append("shape")
+    if not held:
+        return system, ()
+    return system.without(keep, use_shape=use_shape), tuple(held)
+
+
+def _shape_bias(system: OverlapSystem, emissivity: EmissivityModel, errors: ErrorModel) -> float:
+    """What noise of the normals can do to s: E averaged over it is E + ½E″σ², projected on D under 65°."""
+    theta, h = np.radians(np.arange(1.0, 65.0)), 1e-3
+    E = [emissivity.relative(np.cos(theta + d)) for d in (-h, 0.0, h)]
+    bend = 0.5 * np.radians(errors.sigma_normal_deg) ** 2 * (E[0] - 2 * E[1] + E[2]) / h**2
+    D = shape_direction(np.cos(theta))
+    return float(bend @ D / (D @ D))
+
+
+def _result(
+    system: OverlapSystem,
+    solution: Solution,
+    group: NDArray,
+    rows: Observations,
+    held: tuple[str, ...],
+    shape_bias: float,
+) -> CrosscalResult:
+    """The solution in terms of views and the whole field."""
+    M, K, _ = system.sizes
+    n, slope = len(group), system.slope_L
+    expand = np.zeros((n + len(system.keep) + 2, M + K + 2))
+    expand[np.arange(n), group] = 1.0
+    expand[n:-2, M : M + K] = system.keep
+    expand[-2, -2], expand[-1, -1] = float(system.use_shape), float(system.use_gain)
+    p, covariance = expand @ solution.p, expand @ solution.covariance @ expand.T
+    level_sigma = _level_sigma(system, solution)
+    shape_sigma = 0.0
+    if system.use_shape:
+        # a relative result's level is off by the mean of the true offsets, and takes s along
+        off = float(np.sqrt(solution.level_variance)) if system.anchored else float(np.std(p[:n]))
+        shape_sigma = float(np.sqrt(covariance[-2, -2] + (solution.level_gain[-2] * off) ** 2 + shape_bias**2))
+    residual = (system.y - system.predict(solution.p, solution.x)) / slope
+    robust = solution.weight * system.sigma2
+    total = np.bincount(rows.view, robust, n)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        view_rms = np.sqrt(np.bincount(rows.view, robust * residual**2, n) / np.where(total > 0, total, np.nan))
+    return CrosscalResult(
+        offset_radiance=p[:n],
+        field=replace(system.field, coefficients=p[n:-2]),
+        shape=float(p[-2]),
+        shape_sigma=shape_sigma,
+        gain=1 + float(p[-1]),
+        pivot_radiance=system.pivot,
+        covariance=covariance,
+        slope_L=slope,
+        anchored=system.anchored,
+        reference_sigma_K=float(np.sqrt(solution.level_variance)) / slope if system.anchored else float("nan"),
+        level_sigma_K=level_sigma,
+        residual_sigma=solution.scale,
+        view_rms_K=view_rms,
+        outlier_fraction=float(1 - np.mean(solution.weight > 0)),
+        condition=condition_number(solution.normal[:M, :M]),
+        held=held,
+        iterations=solution.iterations,
+        converged=solution.converged,
+        messages=_messages(system, solution, held, _groups(rows, n, solution.weight > 0)),
+    )
+
+
+def _level_sigma(system: OverlapSystem, solution: Solution) -> float:
+    """One sigma of the common level of all vertices, K; NaN for a relative result."""
+    if not system.anchored:
+        return float("nan")
+    M, K, P = system.sizes
+    g, w = np.zeros(P), solution.weight / solution.weight.sum()
+    g[:M] = np.bincount(system.group, w, M)
+    g[M : M + K] = w @ system.columns[:, :K]
+    return float(np.sqrt(g @ solution.covariance @ g + solution.level_variance) / system.slope_L)
+
+
+def _messages(system: OverlapSystem, solution: Solution, held: tuple[str, ...], groups: int) -> tuple[str, ...]:
+    out = []
+    if not solution.converged:
+        out.append("the cross-calibration stopped before it converged")
+    if not system.anchored:
+        out.append("no reference sets the level: temperatures are relative")
+    if held:
+        out.append(f"held, because the overlap does not carry it: {', '.join(held)}")
+    if groups > 1:
+        out.append(f"the views fall into {groups} groups that share no surface: their levels are not tied")
+    if system.use_shape and not SHAPE_BOUNDS[0] < solution.p[-2] < SHAPE_BOUNDS[1]:
+        out.append("the shape of ε(θ) ran to its bound: check normals, angle limit and reflected temperature")
+    return tuple(out)
+
+
+def _groups(rows: Observations, n_views: int, alive: Bool) -> int:
+    """Number of groups of views connected by at least `MIN_SHARED` common vertices."""
+    seen = csr_matrix((np.ones(int(alive.sum())), (rows.view[alive], rows.vertex[alive])))
+    shared = (seen @ seen.T).toarray()
+    present = np.diag(shared) > 0
+    linked = shared[np.ix_(present, present)] >= min(MIN_SHARED, np.diag(shared).max())
+    return int(connected_components(linked)[0])

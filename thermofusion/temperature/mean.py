@@ -1,0 +1,150 @@
+"""The weighted, robust mean of each vertex's observations: millions of rows, grouped by vertex."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csc_matrix, csr_matrix
+
+from ..robust import MAD_PER_SIGMA, TUKEY, huber_weight, tukey_weight
+from ..types import Float, Float32, Int
+
+L1_STEPS, TUKEY_STEPS = 4, 3
+SCALE_ROWS = 200_000  # enough for a robust scale
+L1_FLOOR = 0.3  # of one sigma: below it the L1 start is quadratic
+LEAST_WEIGHT = 0.02  # share of a vertex's weight that must survive Tukey's
+
+
+@dataclass(frozen=True, eq=False)
+class Groups:
+    """Rows that belong together, one after the other: group g has the rows start[g]..start[g] + count[g] - 1.
+
+    Every group has a row. vertex : (G,) the vertex each group stands for, rising.
+    """
+
+    vertex: Int
+    start: NDArray[np.intp]
+    count: NDArray[np.intp]
+
+    @classmethod
+    def by_vertex(cls, vertex: Int, n_vertices: int) -> tuple[Groups, NDArray]:
+        """Groups of equal vertices, and the order (N,) that brings rows into groups and keeps it within them."""
+        n = len(vertex)
+        # a transposed sparse matrix is a counting sort
+        sorted_ = csc_matrix((np.arange(n, dtype=np.int32), vertex, np.arange(n + 1)), shape=(n_vertices, n)).tocsr()
+        count = np.diff(sorted_.indptr)
+        present = np.flatnonzero(count)
+        return cls(present.astype(np.int32), sorted_.indptr[present].astype(np.intp), count[present]), sorted_.data
+
+    def __len__(self) -> int:
+        return len(self.vertex)
+
+    def sums(self, values: NDArray) -> Float:
+        """Sum of row values (N,) per group, (G,)."""
+        if not len(self):
+            return np.zeros(0)
+        return np.asarray(np.add.reduceat(values, self.start, dtype=np.float64))
+
+    def weighted_sums(self, weights: NDArray, columns: NDArray) -> Float:
+        """Σ weight · row of columns (N, K) per group, (G, K)."""
+        n = len(weights)
+        edges = np.append(self.start, n)
+        return np.asarray(csr_matrix((weights, np.arange(n), edges), shape=(len(self), n)) @ columns, np.float64)
+
+    def rows(self, values: NDArray) -> NDArray:
+        """Values of groups (G,) at their rows, (N,)."""
+        return np.repeat(values, self.count)
+
+    def least(self, cost: NDArray) -> NDArray[np.intp]:
+        """The row of least cost of each group, the first among equals, (G,)."""
+        if not len(self):
+            return np.zeros(0, np.intp)
+        candidates = np.flatnonzero(cost == self.rows(np.minimum.reduceat(cost, self.start)))
+        return candidates[np.searchsorted(candidates, self.start)]
+
+
+@dataclass(frozen=True, eq=False)
+class RobustMean:
+    """Rows of y = E·x with weights: x is a vertex's normal-equivalent excess over what it reflects.
+
+    weight : statistical (1/σ² in radiance) or geometric. robust : weight in the end; written by `solve`.
+    """
+
+    groups: Groups
+    y: Float
+    E: Float
+    weight: Float32
+    robust: Float32
+    statistical: bool
+
+    def solve(self, *, robust: bool, scale: float | None = None) -> Float:
+        """x (G,). Robust: weights of an L1 fit, then Tukey's.
+
+        scale : of residuals over the rows' own σ; None = taken from the residuals.
+        """
+        x = self._estimate(self.weight)
+        if not robust or not len(x):
+            return x
+        root = np.sqrt(self.weight if self.statistical else self.weight / np.float32(np.median(self.weight)))
+        sample = self._scale_rows() if scale is None else None
+        for _ in range(L1_STEPS):
+            self._reweight(x, root, L1_FLOOR * (scale or self._scale(x, root, sample)), huber_weight)
+            x = self._estimate(self.robust)
+        l1 = self.robust.copy()
+        for _ in range(TUKEY_STEPS):
+            self._reweight(x, root, TUKEY * (scale or self._scale(x, root, sample)), tukey_weight)
+            self._keep_measured(l1)
+            x = self._estimate(self.robust)
+        return x
+
+    def residual(self, x: Float) -> Float32:
+        """y - E·x of all rows."""
+        return np.asarray(self.y - self.E * self.groups.rows(x), np.float32)
+
+    def denominator(self, weight: Float32) -> Float:
+        """Σ w E² per group."""
+        return self.groups.sums(weight * self.E * self.E)
+
+    def scatter(self, x: Float) -> tuple[Float, Float]:
+        """Per group: rms of residuals in sigmas of the rows' own errors, and in radiance; NaN with one row only."""
+        squares, n = self.residual(x) ** 2, self.groups.count
+        freedom = np.where(n > 1, n - 1, np.nan)
+        sigmas = np.sqrt(self.groups.sums(self.weight * squares) / freedom)
+        spread = self.groups.sums(self.robust * squares) / self.groups.sums(self.robust)
+        return sigmas, np.sqrt(spread * n / freedom)
+
+    def _estimate(self, weight: Float32) -> Float:
+        wE = weight * self.E
+        return self.groups.sums(wE * self.y) / self.groups.sums(wE * self.E)
+
+    def _reweight(self, x: Float, root: Float32, reach: float, factor: Callable[[NDArray], NDArray]) -> None:
+        """Weights times a factor of the standardised residual in units of `reach`."""
+        self.robust[:] = self.weight * factor(np.abs(self.residual(x)) * root / np.float32(reach))
+
+    def _keep_measured(self, l1: Float32) -> None:
+        """Vertices on which all rows contradict each other keep the weights of the L1 fit."""
+        lost = self.groups.sums(self.robust) < LEAST_WEIGHT * self.groups.sums(self.weight)
+        if lost.any():
+            rows = self.groups.rows(lost)
+            self.robust[rows] = l1[rows]
+
+    def _scale_rows(self) -> tuple[NDArray, Float]:
+        """Rows that the robust scale is taken from, and what makes up for their vertex's own freedom.
+
+        An even sample of the vertices with two rows or more, by number: whatever the views' order.
+        """
+        stride = max(1, len(self.y) // SCALE_ROWS)
+        chosen = (self.groups.vertex % stride == 0) & (self.groups.count > 1)
+        pick = np.flatnonzero(self.groups.rows(chosen))
+        n = self.groups.rows(self.groups.count)[pick]
+        return pick, np.sqrt(n / (n - 1))
+
+    def _scale(self, x: Float, root: Float32, sample: tuple[NDArray, Float] | None) -> float:
+        """Robust scale of standardised residuals."""
+        if sample is None or not len(sample[0]):
+            return 1.0
+        pick, freedom = sample
+        return max(float(np.median(np.abs(self.residual(x)[pick]) * root[pick] * freedom)) / MAD_PER_SIGMA, 1e-3)

@@ -1,0 +1,308 @@
+"""The least squares system of overlapping views: columns of observations in, offsets, field and shape out.
+
+The unknowns of vertices are eliminated analytically, so that what is solved has the size views + field + shape. See
+`crosscal` for the model and docs/radiometry.md for its derivation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import csr_matrix
+
+from ..mapping.references import BlackbodyReading
+from ..robust import HUBER, MAD_PER_SIGMA, TUKEY, huber_weight, tukey_weight
+from ..types import Float, Int
+from .field import ImageField
+
+HUBER_STEPS, TUKEY_STEPS = 4, 40
+CONVERGED_K = 1e-4  # a hundredth of what any result is good to
+OFFSET_PRIOR_K = 5.0  # spread of offsets about their mean: only matters for views that overlap with none
+FIELD_PRIOR_K = {1: 0.15, 2: 0.15, 3: 0.07, 4: 0.07}  # rms of a field pattern by polynomial order; 0.1-0.3 K together
+FIELD_UNKNOWN_K, FIELD_MEMORY = 0.3, 0.25  # one sigma of the field's change over this share of the image width
+SHAPE_PRIOR = 2.0
+SHAPE_BOUNDS = (-2.0, 5.0)
+GAIN_PRIOR = 0.1
+READING_FLOOR_K = 0.01  # what a field of low order leaves at a reference's place
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Parameters p = [offsets (M), field (K), s, γ] with what is known about them."""
+
+    p: Float
+    x: Float  # (V,) normal-equivalent excess of vertices
+    covariance: Float  # at a given level
+    normal: Float  # reduced normal matrix, priors included
+    weight: Float  # of observations, robust factor included
+    scale: float  # of standardised residuals; 1 = as predicted
+    level_gain: Float  # dp / d(level)
+    level_variance: float
+    iterations: int
+    converged: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """The hard constraint row·p = target that sets the common level, and the variance of the target."""
+
+    row: Float
+    target: float
+    variance: float
+
+
+@dataclass(frozen=True)
+class KnownField:
+    """The place at which the field is read for a reference: its own, or the nearest at which skin was seen.
+
+    A polynomial says nothing beyond its data: there the field is held, less certain with the distance `away` [image
+    widths]."""
+
+    u_px: float
+    v_px: float
+    away: float = 0.0
+
+    @property
+    def sigma_K(self) -> float:
+        return FIELD_UNKNOWN_K * min(self.away / FIELD_MEMORY, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class ContactRow:
+    """Vertices around a contact thermometer: their mean x should be `expected`."""
+
+    vertices: Int
+    expected: float
+    sigma: float
+
+
+@dataclass(frozen=True, eq=False)
+class OverlapSystem:
+    """Rows y = (E + s·D)·x[vertex] + b[group] + φ + γ·(L_r - pivot), with variances; vertices numbered without gaps.
+
+    x holds the camera's gain 1 + γ. columns : (N, K + 2): field patterns, D·x of the last step, L_r - pivot.
+    group : (N,) the offset's index. keep : (K_all, K) combinations of the field's patterns that are solved for.
+    order, start : rows by vertex. reading_places : where the field is taken for each reading. correlated : how many
+    vertices err alike (neighbours share their normal, and all share rig and shape): the data's information is divided
+    by it where it meets other knowledge.
+    """
+
+    vertex: Int
+    group: Int
+    y: Float
+    E: Float
+    D: Float
+    sigma2: Float
+    columns: Float
+    order: Int
+    start: Int
+    n_groups: int
+    field: ImageField
+    keep: Float
+    use_shape: bool
+    use_gain: bool
+    slope_L: float
+    pivot: float
+    readings: tuple[BlackbodyReading, ...]
+    reading_groups: tuple[int, ...]
+    contacts: tuple[ContactRow, ...]
+    reading_places: tuple[KnownField, ...] = ()
+    correlated: float = 1.0
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """M offsets, K field patterns, P parameters."""
+        return self.n_groups, self.keep.shape[1], self.n_groups + self.keep.shape[1] + 2
+
+    @property
+    def n_vertices(self) -> int:
+        return len(self.start) - 1
+
+    @property
+    def anchored(self) -> bool:
+        return bool(self.readings or self.contacts)
+
+    def without(self, keep: Float, *, use_shape: bool) -> OverlapSystem:
+        """The system with fewer combinations of field patterns, or without the shape."""
+        K = self.keep.shape[1]
+        columns = np.concatenate([self.columns[:, :K] @ (self.keep.T @ keep), self.columns[:, K:]], axis=1)
+        return replace(self, keep=keep, columns=np.ascontiguousarray(columns), use_shape=use_shape)
+
+    # ---------------------------------------------------------------- iteration
+
+    def solve(self) -> Solution:
+        """Iteratively reweighted least squares: Huber to a first estimate, weighted medians per vertex, then Tukey."""
+        M, K, P = self.sizes
+        p = np.zeros(P)
+        x = np.bincount(self.vertex, self.y) / np.diff(self.start)
+        weight, scale = self._robust(p, x, huber=True)
+        converged, n = False, 0
+        while not converged and n < HUBER_STEPS + TUKEY_STEPS:
+            n += 1
+            before = p
+            p, x, covariance, normal, gain, variance = self._step(p, x, weight)
+            change = np.abs(p - before)
+            change[: M + K] /= self.slope_L
+            converged = n > HUBER_STEPS + 1 and bool(change.max() < CONVERGED_K)
+            if n == HUBER_STEPS:
+                x = self._medians(p)
+            if not converged:
+                weight, scale = self._robust(p, x, huber=n < HUBER_STEPS)
+        return Solution(p, x, covariance * scale**2, normal, weight, scale, gain, variance, n, converged)
+
+    def predict(self, p: Float, x: Float | float) -> Float:
+        """The model of y, (N,)."""
+        M, K, _ = self.sizes
+        at_rows = x[self.vertex] if isinstance(x, np.ndarray) else x
+        out = (self.E + p[M + K] * self.D) * at_rows + p[self.group]
+        if K:
+            out += self.columns[:, :K] @ p[M : M + K]
+        if self.use_gain:
+            out += p[-1] * self.columns[:, -1]
+        return np.asarray(out)
+
+    def _robust(self, p: Float, x: Float, *, huber: bool) -> tuple[Float, float]:
+        """Weights 1/σ² times the robust factor, and the scale of standardised residuals."""
+        r = np.abs(self.y - self.predict(p, x)) / np.sqrt(self.sigma2)
+        freedom = max(len(r) - len(x), len(r) // 4, 1)
+        scale = max(float(np.median(r)) / MAD_PER_SIGMA * np.sqrt(len(r) / freedom), 1e-3)
+        t = r / (scale * (HUBER if huber else TUKEY))
+        factor = huber_weight(t) if huber else tukey_weight(t)
+        return factor / self.sigma2, scale
+
+    def _medians(self, p: Float) -> Float:
+        """Weighted median of x per vertex, all else given."""
+        M, K, _ = self.sizes
+        E = self.E + p[M + K] * self.D
+        value = (self.y - self.predict(p, 0.0)) / E
+        order = np.lexsort((value, self.vertex))
+        w = np.cumsum((E / self.sigma2)[order])
+        total = w[self.start[1:] - 1]
+        begin = np.insert(total[:-1], 0, 0.0)
+        half = np.searchsorted(w, 0.5 * (begin + total))
+        return np.asarray(value[order][np.minimum(half, self.start[1:] - 1)])
+
+    def _step(self, p: Float, x: Float, w: Float) -> tuple[Float, Float, Float, Float, Float, float]:
+        """One Gauss-Newton step with x eliminated: p, x, covariance, normal matrix, dp/d(level), level variance."""
+        M, K, P = self.sizes
+        s, G = p[M + K], self.columns
+        E = self.E + s * self.D
+        G[:, K] = self.D * x[self.vertex] if self.use_shape else 0.0
+        y = self.y + s * G[:, K]  # s enters as s_old + δ: give back what the linearisation at s_old took
+
+        wE = w * E
+        by_vertex = csr_matrix((wE[self.order], self.order, self.start), shape=(self.n_vertices, len(w)))
+        a = by_vertex @ E
+        a[a <= 0] = np.inf
+        c = by_vertex @ y
+        B = np.empty((len(a), P))
+        to_group = (by_vertex.data, self.group[self.order], self.start)
+        B[:, :M] = csr_matrix(to_group, shape=(len(a), M)).toarray()
+        B[:, M:] = by_vertex @ G
+
+        wG = w[:, None] * G
+        by_group = csr_matrix((np.ones(len(w)), self.group, np.arange(len(w) + 1)), shape=(len(w), M)).T
+        N, rhs = np.zeros((P, P)), np.empty(P)
+        N[np.arange(M), np.arange(M)] = by_group @ w
+        N[:M, M:] = by_group @ wG
+        N[M:, :M] = N[:M, M:].T
+        N[M:, M:] = G.T @ wG
+        rhs[:M], rhs[M:] = by_group @ (w * y), wG.T @ y
+
+        level = self._level(a, c, B)
+        N -= B.T @ (B / a[:, None])
+        rhs -= B.T @ (c / a)
+        N /= self.correlated
+        rhs /= self.correlated
+        self._add_priors(N, rhs)
+        p, covariance, level_gain = constrained_minimum(N, rhs, level.row, level.target)
+        p[M + K] = np.clip(p[M + K], *SHAPE_BOUNDS)
+        return p, (c - B @ p) / a, covariance, N, level_gain, level.variance
+
+    def field_prior(self) -> Float:
+        """(K, K) inverse covariance of the combinations solved for, before the data."""
+        prior = np.array([(FIELD_PRIOR_K[n] * self.slope_L) ** -2 for n in self.field.orders])
+        return np.asarray(self.keep.T @ (prior[:, None] * self.keep))
+
+    def _add_priors(self, N: Float, rhs: Float) -> None:
+        """Weak knowledge that only matters where the overlap has none, never about the common level."""
+        M, K, P = self.sizes
+        N[:M, :M] += (OFFSET_PRIOR_K * self.slope_L) ** -2 * (np.eye(M) - 1 / M)
+        N[M : M + K, M : M + K] += self.field_prior()
+        N[P - 2, P - 2] += SHAPE_PRIOR**-2
+        N[P - 1, P - 1] += GAIN_PRIOR**-2
+        if self.readings:
+            level = self._mean_reading()
+            for reading, row, weight in self._reading_rows():
+                tilt, target = row - level.row, reading.measured - reading.expected - level.target
+                N += weight * np.outer(tilt, tilt)
+                rhs += weight * target * tilt
+
+    # ---------------------------------------------------------------- the level
+
+    def _reading_rows(self) -> list[tuple[BlackbodyReading, Float, float]]:
+        """Each reading with its derivative by the parameters and its weight."""
+        M, K, P = self.sizes
+        out = []
+        for reading, group, place in zip(self.readings, self.reading_groups, self._places(), strict=True):
+            row = np.zeros(P)
+            row[group] = 1.0
+            if np.isfinite(place.away):
+                at = self.field.patterns(np.array([place.u_px]), np.array([place.v_px]))
+                row[M : M + K] = (at @ self.keep)[0]
+            row[-1] = reading.expected - self.pivot if self.use_gain else 0.0
+            out.append((reading, row, 1 / (reading.sigma_measured**2 + (READING_FLOOR_K * self.slope_L) ** 2)))
+        return out
+
+    def _places(self) -> tuple[KnownField, ...]:
+        return self.reading_places or tuple(KnownField(r.u_px, r.v_px) for r in self.readings)
+
+    def _mean_reading(self) -> Level:
+        rows = self._reading_rows()
+        w = np.array([weight for _, _, weight in rows])
+        variance = 1 / w.sum() + max(r.sigma_expected for r in self.readings) ** 2
+        w /= w.sum()
+        if self.keep.shape[1]:
+            variance += (self.slope_L * sum(wi * p.sigma_K for wi, p in zip(w, self._places(), strict=True))) ** 2
+        row = np.sum([wi * row for wi, (_, row, _) in zip(w, rows, strict=True)], axis=0)
+        target = np.sum([wi * (r.measured - r.expected) for wi, r in zip(w, self.readings, strict=True)])
+        return Level(row, float(target), float(variance))
+
+    def _level(self, a: Float, c: Float, B: Float) -> Level:
+        """Blackbodies set the level; else contact thermometers; else the offsets' mean is zero."""
+        if self.readings:
+            return self._mean_reading()
+        if self.contacts:
+            w = np.array([1 / max(k.sigma, 1e-9) ** 2 for k in self.contacts])
+            rows = [np.mean(B[k.vertices] / a[k.vertices, None], axis=0) for k in self.contacts]
+            targets = np.array([np.mean(c[k.vertices] / a[k.vertices]) - k.expected for k in self.contacts])
+            share = w / w.sum()
+            return Level(share @ np.array(rows), float(share @ targets), float(1 / w.sum()))
+        M, _, P = self.sizes
+        return Level(np.concatenate([np.full(M, 1 / M), np.zeros(P - M)]), 0.0, 0.0)
+
+
+def constrained_minimum(N: Float, rhs: Float, row: Float, target: float) -> tuple[Float, Float, Float]:
+    """min ½pᵀNp - rhsᵀp under row·p = target: (p, covariance within the constraint's plane, dp/dtarget).
+
+    Parameters differ by orders of magnitude: the system is scaled to a unit diagonal first.
+    """
+    d = 1 / np.sqrt(np.maximum(np.diag(N), 1e-30))
+    P, r = len(d), row * d
+    norm = np.linalg.norm(r)
+    kkt = np.zeros((P + 1, P + 1))
+    kkt[:P, :P] = N * np.outer(d, d)
+    kkt[:P, P] = kkt[P, :P] = r / norm
+    inverse = np.linalg.inv(kkt)
+    p = d * (inverse[:P, :P] @ (rhs * d) + inverse[:P, P] * (target / norm))
+    return p, inverse[:P, :P] * np.outer(d, d), d * inverse[:P, P] / norm
+
+
+def condition_number(N: Float) -> float:
+    """Condition of a normal matrix of offsets on what overlap can see: the common level left out."""
+    if len(N) < 2:
+        return 1.0
+    centred = np.eye(len(N)) - 1 / len(N)
+    values = np.linalg.eigvalsh(centred @ N @ centred)[1:]
+    return float(values[-1] / max(values[0], 1e-300))

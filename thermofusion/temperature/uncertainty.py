@@ -1,0 +1,246 @@
+"""How far one observation can be trusted, and how the errors of many add up in one vertex.
+
+The parts of one observation's error follow the error budget of docs/radiometry.md; each is a one-sigma in the radiance
+that the camera reports, so that 1/Σσ² is the observation's statistical weight (it replaces the plain cosθ/d²).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erfc
+
+from ..physics.band import Band
+from ..physics.emissivity import AngleTable, EmissivityModel
+from ..types import Float, Float32, Observations
+
+MAX_LEVER = 4.0  # bound on a normal error's lever near grazing, where the linear form no longer holds
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorModel:
+    """One-sigma errors of what an observation depends on.
+
+    netd_K : noise of a pixel. sigma_normal_deg : of the surface normal, per axis. sigma_shape : relative, of 1-E(θ),
+    where it is not fitted. sigma_registration_px : of the thermal image on the surface. sigma_reflected_K : of the
+    room's reflected temperature. gradient_K_per_m : temperature gradient along the surface, scalar or (V,).
+    sigma_emissivity0 : of ε(0). psf_sigma_px : point spread of the thermal image, which mixes room into skin at
+    silhouettes; edge_margin_px : how much nearer a silhouette may be than the mesh says.
+    """
+
+    netd_K: float = 0.05
+    sigma_normal_deg: float = 2.0
+    sigma_shape: float = 0.15
+    sigma_registration_px: float = 0.5
+    sigma_reflected_K: float = 1.0
+    gradient_K_per_m: float | Float32 = 0.0
+    sigma_emissivity0: float = 0.01
+    psf_sigma_px: float = 0.7
+    edge_margin_px: float = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class AngleTables:
+    """E(θ) = ε(θ)/ε(0), float64, and |dE/dθ| [rad-1], float32, as fast tables over cosθ."""
+
+    relative: AngleTable
+    slope: AngleTable
+
+    @classmethod
+    def of(cls, model: EmissivityModel) -> AngleTables:
+        mu = AngleTable.knots()
+        theta = np.arccos(np.clip(mu, 1e-4, 1 - 1e-9))
+        slope = np.minimum(np.abs(model.derivative(theta)) / model.normal, MAX_LEVER)
+        return cls(AngleTable.of(model.relative(mu), np.float64), AngleTable.of(slope))
+
+
+def observation_variance(
+    observations: Observations,
+    excess: float | NDArray,
+    tables: AngleTables,
+    errors: ErrorModel,
+    slope_L: float,
+) -> Float32:
+    """Variance of each observation about the model L_r + E·x + b, (N,) float32, (W m-2 sr-1)².
+
+    excess : x, normal-equivalent radiance above what is reflected, scalar or (N,). slope_L : dL/dT at skin
+    temperature, which turns K into radiance. Parts: noise; normals; shape of ε; registration on a gradient; T_refl;
+    room mixed in at silhouettes.
+    """
+    cos = observations.cos_angle
+    x = np.asarray(excess, np.float32)
+    variance = np.full(len(cos), (errors.netd_K * slope_L) ** 2, np.float32)
+    loss = (1 - tables.relative(cos)).astype(np.float32)
+    variance += (x * tables.slope(cos) * np.float32(np.radians(errors.sigma_normal_deg))) ** 2
+    variance += (loss * (np.abs(x) * np.float32(errors.sigma_shape))) ** 2
+    variance += (loss * np.float32(errors.sigma_reflected_K * slope_L)) ** 2
+    variance += (x * silhouette_share(observations.edge_px, errors)) ** 2
+    gradient = np.asarray(errors.gradient_K_per_m, np.float32)
+    if np.any(gradient):
+        g = gradient.take(observations.vertex) if gradient.ndim else gradient
+        variance += (g * np.float32(slope_L) * registration_m(observations, errors)) ** 2
+    return variance
+
+
+def registration_m(observations: Observations, errors: ErrorModel) -> Float32:
+    """Registration error along the surface, m: pixels x range/(f cosθ), with range/f from the footprint."""
+    per_px = np.sqrt(observations.footprint_m2 / np.maximum(observations.cos_angle, np.float32(0.05)))
+    return np.asarray(np.float32(errors.sigma_registration_px) * per_px, np.float32)
+
+
+def silhouette_share(edge_px: NDArray, errors: ErrorModel) -> Float32:
+    """Share of a pixel's signal that comes from beyond a straight silhouette `edge_px` away: ½ erfc(d/√2σ).
+
+    For 10 K of contrast and 0.7 px: 766/161/21/2/0.1 mK at 1/1.5/2/2.5/3 px.
+    """
+    out = np.zeros(len(edge_px), np.float32)
+    near = np.flatnonzero(edge_px < errors.edge_margin_px + 4.5 * errors.psf_sigma_px)
+    d = np.maximum(edge_px[near] - np.float32(errors.edge_margin_px), 0)
+    out[near] = 0.5 * erfc(d / np.float32(np.sqrt(2) * errors.psf_sigma_px))
+    return out
+
+
+def skin_slope(band: Band, radiance: NDArray) -> float:
+    """dL/dT at the median of observed radiances: the factor between K and W m-2 sr-1 in weights and bounds."""
+    typical = float(np.nanmedian(radiance[:: max(1, len(radiance) // 10_000)])) if len(radiance) else float("nan")
+    T = float(band.temperature_K(typical))
+    return float(band.d_radiance_dT(T if np.isfinite(T) else 306.15))
+
+
+# ---------------------------------------------------------------- per vertex
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """One sigma of a result: per vertex, and of the level common to all vertices. K; NaN = unmeasured.
+
+    What errs from vertex to vertex and what shifts all vertices together are kept apart: the first decides whether a
+    difference within the result is real, the second whether its level is. For one vertex's absolute temperature both
+    count: √(total² + level²).
+
+    total_K : (V,) float32, one sigma about the common level; total² = Σ parts². parts_K : (V,) each.
+        noise : of the pixels. calibration : offsets and field of the views. shape : of ε(θ), where it is not fitted.
+        normals : of the surface. registration : thermal image on a temperature gradient. silhouette : room mixed in at
+        the body's outline. air : differences in the air path. emissivity0, reflected : what errors of ε(0) and T_refl
+        do beyond their common shift. views : how far views disagree, for methods that do not calibrate them.
+    level_parts_K : reference, emissivity0, reflected: one number each. A relative result has no reference: its level is
+        unknown beyond these.
+    """
+
+    total_K: Float32
+    parts_K: dict[str, Float32]
+    level_parts_K: dict[str, float]
+    common_K: dict[str, Float32]  # signed effect per vertex of one sigma of what is common
+
+    @classmethod
+    def of(cls, parts_K: dict[str, NDArray], common_K: dict[str, NDArray] | None = None) -> Uncertainty:
+        """From parts of single vertices and signed effects (V,) of common errors."""
+        parts = {name: np.asarray(value, np.float32) for name, value in parts_K.items()}
+        common = {name: np.asarray(value, np.float32) for name, value in (common_K or {}).items()}
+        level = {}
+        for name, effect in common.items():
+            known = effect[np.isfinite(effect)]
+            level[name] = float(np.median(known)) if len(known) else 0.0
+            if len(known) and np.ptp(known) > 0:
+                parts[name] = np.abs(effect - np.float32(level[name]))
+        total = np.sqrt(np.sum([p.astype(np.float64) ** 2 for p in parts.values()], axis=0))
+        return cls(total.astype(np.float32), parts, {k: abs(v) for k, v in level.items()}, common)
+
+    @property
+    def absolute_K(self) -> Float32:
+        """(V,) one sigma of a vertex's temperature on an absolute scale: its parts, and all of what is common."""
+        own = {name: value for name, value in self.parts_K.items() if name not in self.common_K}
+        squares = [v.astype(np.float64) ** 2 for v in (*own.values(), *self.common_K.values())]
+        return np.sqrt(np.sum(squares, axis=0)).astype(np.float32)
+
+    @property
+    def level_K(self) -> float:
+        """One sigma of the common level."""
+        return float(np.sqrt(sum(v**2 for v in self.level_parts_K.values())))
+
+
+@dataclass(frozen=True, eq=False)
+class Levers:
+    """How errors of observations reach a vertex: x = Σ h·(L - L_r), with h = wE/ΣwE² in each row.
+
+    All sums run over a vertex's rows, (V,). squared : Σh². total : Σh. loss : Σ h(1-E). slope, slope_squared : Σ h|E'|
+    and Σ (hE')². registration_m : Σ h·m. silhouette : Σ h·share of the room. modes : (V, R) effect of each mode of the
+    calibration's covariance.
+    """
+
+    squared: Float
+    total: Float
+    loss: Float
+    slope: Float
+    slope_squared: Float
+    registration_m: Float
+    silhouette: Float
+    modes: Float
+
+
+def vertex_uncertainty(
+    levers: Levers,
+    x: Float,
+    T_K: Float,
+    *,
+    epsilon0: float,
+    absolute: bool,
+    slope_L: float,
+    slope_reflected: float,
+    errors: ErrorModel,
+    shape_fitted: bool,
+    epsilon0_follows: bool,
+    reference_sigma_K: float,
+    air_K: float | None,
+    transmission_per_m: float,
+    path_m: NDArray,
+    views_K: NDArray | None,
+) -> tuple[dict[str, NDArray], dict[str, NDArray]]:
+    """Errors of each vertex, K: (parts, signed effects of what is common), for `Uncertainty.of`.
+
+    x : (V,) normal-equivalent excess. absolute : the output is divided by ε(0), else normal-equivalent. path_m : (V,)
+    distance beyond the typical one. The budget is that of docs/radiometry.md.
+    """
+    scale = 1 / (slope_L * (epsilon0 if absolute else 1.0))  # radiance of x -> K of the output
+    zero = np.zeros(len(x))
+    normal = np.radians(errors.sigma_normal_deg)
+    # An error of a normal tilts the surface to some views and away from others: between coherent and independent.
+    tilt = np.sqrt(0.5 * (levers.slope**2 + levers.slope_squared))
+    reflected = 1 - levers.total / (epsilon0 if absolute else 1.0)  # dL_s/dL_r
+    sigma_epsilon0 = (
+        min(errors.sigma_emissivity0, LINKED_EPSILON0_SIGMA) if epsilon0_follows else errors.sigma_emissivity0
+    )
+    # The level comes from a reference (or is relative), so only the path's differences count; a corrected path is taken
+    # to be right to a third of itself.
+    air_loss = AIR_LOSS_PER_M if transmission_per_m == 1 else (1 - transmission_per_m) / 3
+    parts = {
+        "noise": scale * errors.netd_K * slope_L * np.sqrt(BILINEAR_VARIANCE * levers.squared),
+        "calibration": scale * np.sqrt((levers.modes**2).sum(1)),
+        "shape": zero if shape_fitted else scale * np.abs(x * levers.loss) * errors.sigma_shape,
+        "normals": scale * np.abs(x) * tilt * normal,
+        "registration": np.asarray(errors.gradient_K_per_m) * levers.registration_m,
+        "silhouette": scale * np.abs(x) * levers.silhouette,
+        "air": zero if air_K is None else np.abs(T_K - air_K) * air_loss * np.abs(path_m),
+    }
+    if views_K is not None:
+        parts["views"] = np.nan_to_num(views_K)
+    common = {
+        "reference": zero + np.nan_to_num(reference_sigma_K) / (epsilon0 if absolute else 1.0),
+        "emissivity0": scale * x / epsilon0 * sigma_epsilon0 if absolute else zero,
+        "reflected": reflected * errors.sigma_reflected_K * slope_reflected / slope_L,
+    }
+    return parts, common
+
+
+def covariance_modes(covariance: Float, count: int) -> Float:
+    """(P, R) vectors whose outer products add up to the `count` strongest modes of a covariance (P, P)."""
+    values, vectors = np.linalg.eigh(covariance)
+    top = np.argsort(values)[::-1][:count]
+    return np.asarray(vectors[:, top] * np.sqrt(np.maximum(values[top], 0)))
+
+
+BILINEAR_VARIANCE = 4 / 9  # mean over sub-pixel positions of the noise variance left by bilinear sampling
+AIR_LOSS_PER_M = 0.006  # 1-τ of a metre of room air at 50 % humidity, 7.5-13.5 µm (62 mK at 10 K contrast)
+LINKED_EPSILON0_SIGMA = 0.003  # of ε(0) where it follows the fitted shape of a smooth surface
