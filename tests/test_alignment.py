@@ -19,8 +19,12 @@ from thermofusion.types import Scan, SurfaceMesh, Trajectory
 
 
 def turned(scan: Scan, rotation_deg: list[float], translation_m: tuple[float, ...] = (0, 0, 0)) -> Scan:
-    T = se3_exp(np.array([*np.radians(rotation_deg), *translation_m])) @ scan.rig.T_thermal_depth
-    return replace(scan, rig=replace(scan.rig, T_thermal_depth=T))
+    T = se3_exp(np.array([*np.radians(rotation_deg), *translation_m])) @ scan.thermal.camera.T_thermal_depth
+    return with_camera(scan, T_thermal_depth=T)
+
+
+def with_camera(scan: Scan, **changes) -> Scan:
+    return replace(scan, thermal=replace(scan.thermal, camera=replace(scan.thermal.camera, **changes)))
 
 
 def delayed(scan: Scan, seconds: float) -> Scan:
@@ -91,7 +95,7 @@ def test_a_rig_off_by_degrees_is_searched_for(body, scan, rotation_deg):
 def test_right_rig_is_left_alone(body, scan):
     result = align_thermal(scan, body, walk(), RECIPE)
     assert not result.changed
-    np.testing.assert_array_equal(result.T_thermal_depth, scan.rig.T_thermal_depth)
+    np.testing.assert_array_equal(result.T_thermal_depth, scan.thermal.camera.T_thermal_depth)
     assert result.time_offset_s == 0
     assert "left alone" in result.messages[0]
     assert result.residual_px_before == pytest.approx(result.residual_px_after)
@@ -100,7 +104,7 @@ def test_right_rig_is_left_alone(body, scan):
 
 def test_the_sensors_own_offset_is_the_start(body, scan):
     """A clock shift that scan.json already declares is none."""
-    declared = replace(delayed(scan, 0.25), sensor=replace(scan.sensor, time_offset_s=-0.25))
+    declared = with_camera(delayed(scan, 0.25), time_offset_s=-0.25)
     result = align_thermal(declared, body, walk(), RECIPE)
     assert not result.changed
     assert result.time_offset_s == -0.25
@@ -117,7 +121,7 @@ def test_nothing_to_see_says_so(body, scan):
     result = align_thermal(nothing, body, walk(), RECIPE)
     assert not result.changed
     assert not result.converged
-    np.testing.assert_array_equal(result.T_thermal_depth, nothing.rig.T_thermal_depth)
+    np.testing.assert_array_equal(result.T_thermal_depth, nothing.thermal.camera.T_thermal_depth)
     assert "does not stand out" in result.messages[0]
     assert result.sigma_time_s == PRIOR_TIME_S
 

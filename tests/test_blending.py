@@ -23,7 +23,7 @@ from thermofusion.temperature.uncertainty import (
     observation_variance,
     silhouette_share,
 )
-from thermofusion.types import Observations, SignalCurve, ThermalSensor
+from thermofusion.types import Camera, Observations, ThermalCamera
 
 MODEL = Fresnel(1.33)
 
@@ -280,7 +280,7 @@ def calibration_of(world, readings, L_r, errors):
 
 @pytest.mark.parametrize(("measured", "used"), [(None, 0.7), (1.3, 1.3)])
 def test_a_measured_point_spread_enters_the_budget(measured, used):
-    sensor = ThermalSensor(SignalCurve(), psf_sigma_px=measured)
-    errors = error_model(sensor, load_recipe("torso"))
+    camera = ThermalCamera(Camera(2, 2, np.eye(3)), np.eye(4), psf_sigma_px=measured)
+    errors = error_model(camera, load_recipe("torso"))
     assert errors.psf_sigma_px == used
-    assert errors.netd_K == sensor.netd_K
+    assert errors.netd_K == camera.netd_K

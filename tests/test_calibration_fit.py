@@ -234,7 +234,7 @@ def test_a_rig_file_round_trip_with_covariances_and_report(calibrated, tmp_path)
         np.testing.assert_array_equal(back.covariances[key], c.extrinsic_covariance[key])
     for name, camera in c.cameras.items():
         np.testing.assert_array_equal(back.cameras[name].K, camera.K)
-    assert back.rig().thermal is not None
+    assert back.rig().color is not None
     assert back.document["figures"]["joint_rms_px"]["color"] < 0.2
     html = report_html(c, advice=steps, date="2026-01-01")
     assert html.count("<svg") >= 6

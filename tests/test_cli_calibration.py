@@ -20,8 +20,9 @@ from thermofusion.calibration.thermal.blackbody import read_curve, read_field, w
 from thermofusion.calibration.thermal.radiometric import PixelField, evaluate
 from thermofusion.cli import main
 from thermofusion.scans import open_scan, with_rig
+from thermofusion.scans.common import as_thermal
 from thermofusion.scans.native.write import write_scan
-from thermofusion.types import SignalCurve, ThermalSensor
+from thermofusion.types import Rig, SignalCurve, ThermalCamera
 
 PLANCK = (366_545.0, 1428.0, 1.0, -342.0)
 LEVELS_DEGC = (20.0, 25.0, 30.0, 35.0, 40.0, 45.0)
@@ -112,7 +113,7 @@ def test_a_session_before_a_blackbody(session, tmp_path, capsys):
 
 def test_a_whole_scan_is_flattened(session, tmp_path, capsys):
     scan = make.tiny_scan(frames=6)
-    shape = scan.rig.thermal.shape
+    shape = scan.thermal.camera.lens.shape
     bowl = np.linspace(-1, 1, shape[1])[None, :] * np.ones((shape[0], 1))
     write_scan(scan, tmp_path / "scan")
     write_field(tmp_path / "field.npz", PixelField(bowl[None].astype(np.float32)))
@@ -121,7 +122,7 @@ def test_a_whole_scan_is_flattened(session, tmp_path, capsys):
     )
     assert done["frames"] == 4  # one of five was a shutter frame
     flat = open_scan(tmp_path / "b")
-    assert flat.sensor.signal.kind == "apparent_degC"
+    assert flat.thermal.camera.signal.kind == "apparent_degC"
     np.testing.assert_array_equal(flat.thermal.index, [0, 2, 3, 4])
     expected = np.polynomial.polynomial.polyval(scan.thermal.load(2).astype(float), make.COEFFICIENTS) - bowl
     np.testing.assert_allclose(flat.thermal.load(1), expected, atol=1e-5)
@@ -213,14 +214,13 @@ def waved(offset_s, reach_m=0.2):
     T = np.eye(4)
     T[:3, 3] = 0.02, -0.05, 0
     tiny = make.tiny_scan()
-    rig = replace(tiny.rig, depth=depth_cam, thermal=thermal_cam, T_thermal_depth=T, color=None, T_color_depth=None)
+    camera = ThermalCamera(thermal_cam, T, SignalCurve("apparent_degC"))
     return replace(
         tiny,
-        rig=rig,
+        rig=Rig(depth_cam),
         depth=make.stream([depth(i) for i in range(len(td))], td),
         color=None,
-        thermal=make.stream([thermal(i) for i in range(len(tt))], tt),
-        sensor=ThermalSensor(SignalCurve("apparent_degC")),
+        thermal=as_thermal(make.stream([thermal(i) for i in range(len(tt))], tt), camera),
         references=(),
         trajectory=None,
     )
@@ -258,8 +258,11 @@ def test_a_rig_without_a_curve_leaves_the_scans_own(tmp_path):
     camera = {"width_px": 56, "height_px": 40, "K": [[51.0, 0, 27], [0, 51, 20], [0, 0, 1]]}
     (tmp_path / "rig.json").write_text(json.dumps({"cameras": {"thermal": {**camera, "time_offset_s": 0.07}}}))
     joined = with_rig(scan, tmp_path / "rig.json")
-    assert joined.rig.thermal.K[0, 0] == 51
-    assert vars(joined.sensor) == vars(replace(scan.sensor, time_offset_s=0.07))
+    assert joined.thermal.camera.lens.K[0, 0] == 51
+    ours, own = vars(joined.thermal.camera).copy(), vars(replace(scan.thermal.camera, time_offset_s=0.07)).copy()
+    assert ours.pop("lens") is not own.pop("lens")
+    np.testing.assert_array_equal(ours.pop("T_thermal_depth"), own.pop("T_thermal_depth"))
+    assert ours == own
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ def test_swaying_subject(body):
     sway = np.concatenate([rng.normal(0, np.radians(0.1), (24, 3)), rng.normal(0, 0.004, (24, 3))], axis=1)
     scan = make_scan(body, walk(), sway=sway)
     views, _ = thermal_views(scan, walk(), 0.5)
-    result = view_corrections(scan, body, views)
+    result = view_corrections(scan.thermal, body, views)
     assert result.kept
     assert result.views_fitted == 24
     assert result.residual_px_after < 0.5 * result.residual_px_before
@@ -48,7 +48,7 @@ def test_swaying_subject(body):
 
 def test_still_subject_is_left_alone(body, still):
     views, _ = thermal_views(still, walk(), 0.5)
-    result = view_corrections(still, body, views)
+    result = view_corrections(still.thermal, body, views)
     assert not result.kept
     np.testing.assert_array_equal(result.T_world_thermal, views.T_world_thermal)
     assert np.median(result.correction_mm) < 1.5  # mostly along the line of sight, where an outline says little
@@ -57,7 +57,7 @@ def test_still_subject_is_left_alone(body, still):
 
 def test_nothing_to_see(body, still):
     views, _ = thermal_views(still, walk(), 0.5)
-    result = view_corrections(blank(still), body, views)
+    result = view_corrections(blank(still).thermal, body, views)
     assert not result.kept
     assert result.views_fitted == 0
     assert np.isnan(result.residual_px_before)

@@ -289,9 +289,9 @@ def test_scan_opens_and_says_what_it_should(small):
     np.testing.assert_allclose(
         scan.thermal.times_s[scan.thermal.usable] + config.rig.clock_error_s, truth["thermal_times"], atol=1e-5
     )
-    assert rotation_angle_deg(scan.rig.T_thermal_depth @ np.linalg.inv(truth["T_thermal_depth"])) == pytest.approx(
-        config.rig.rotation_error_deg, abs=1e-6
-    )
+    assert rotation_angle_deg(
+        scan.thermal.camera.T_thermal_depth @ np.linalg.inv(truth["T_thermal_depth"])
+    ) == pytest.approx(config.rig.rotation_error_deg, abs=1e-6)
     depth = scan.depth.load(0)
     assert np.isfinite(depth).mean() > 0.5  # the wall is seen
     shutter = scan.thermal.load(int(np.flatnonzero(~scan.thermal.usable)[0]))
@@ -332,7 +332,7 @@ def test_truth_projects_to_the_images_through_the_solvers_forward_model(tmp_path
     root = simulate(config, tmp_path / "scan", seed=5)
     scan, truth = open_scan(root), np.load(root / "truth" / "surface.npz")
     phantom = build_phantom(config, seed=5)
-    band = SolverBand(*scan.sensor.band_um)
+    band = SolverBand(*scan.thermal.camera.band_um)
     pose, _ = interpolate_trajectory(scan.trajectory, scan.thermal.times_s)
     vertices, normals = truth["vertices_m"].astype(np.float64), phantom.mesh.normals
     from thermofusion.geometry._open3d import o3d
@@ -344,9 +344,9 @@ def test_truth_projects_to_the_images_through_the_solvers_forward_model(tmp_path
         eye = np.linalg.inv(T)[:3, 3]
         ray = eye - vertices
         cos = (ray * normals).sum(1) / np.linalg.norm(ray, axis=1)
-        uv, _ = cv2.projectPoints(vertices, cv2.Rodrigues(T[:3, :3])[0], T[:3, 3], *_k(scan.rig.thermal))
+        uv, _ = cv2.projectPoints(vertices, cv2.Rodrigues(T[:3, :3])[0], T[:3, 3], *_k(scan.thermal.camera.lens))
         uv = np.rint(uv.reshape(-1, 2)).astype(int)
-        h, w = scan.rig.thermal.shape
+        h, w = scan.thermal.camera.lens.shape
         ok = (cos > 0.5) & (uv >= 4).all(1) & (uv < [w - 4, h - 4]).all(1) & (truth["body_fraction"] < 0.6)
         start = vertices + 3e-3 * normals
         rays = np.concatenate([start, eye - start], 1).astype(np.float32)
@@ -369,7 +369,7 @@ def _k(camera):
 def _apparent(scan, i, uv):
     """Counts through the written polynomial, °C."""
     counts = scan.thermal.load(i)[uv[:, 1], uv[:, 0]].astype(np.float64)
-    c = scan.sensor.signal.parameters["coefficients_degC"]
+    c = scan.thermal.camera.signal.parameters["coefficients_degC"]
     return c[0] + c[1] * counts + c[2] * counts**2
 
 
@@ -437,7 +437,7 @@ def test_isothermal_phantom_is_uniform_after_correction(name, recipe, overrides,
     settings = load_recipe(recipe, overrides)
     result = fuse(scan, settings)
     rows, calibration = result.seen.observations, result.temperature.calibration
-    band = SolverBand(*scan.sensor.band_um)
+    band = SolverBand(*scan.thermal.camera.band_um)
     eps = calibration.emissivity(model_from_recipe(settings.emissivity, band))(rows.cos_angle)
     room = band.radiance(273.15 + config.room.reflected_degC)
     corrected = band.temperature_K((calibration.corrected(rows) - (1 - eps) * room) / eps)

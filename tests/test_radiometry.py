@@ -12,7 +12,7 @@ from thermofusion.physics.band import ZERO_DEGC_K, Band
 from thermofusion.physics.emissivity import Fresnel
 from thermofusion.physics.equation import absolute, apparent_radiance, leaving_radiance, normal_equivalent, paper_chain
 from thermofusion.physics.signal import SignalConverter
-from thermofusion.types import SignalCurve, ThermalSensor
+from thermofusion.types import Camera, SignalCurve, ThermalCamera
 
 BAND = Band()
 BANDS = [Band(7.5, 13.5), Band(8, 14), Band(3, 5)]
@@ -130,8 +130,11 @@ def test_anodised_phantom_is_uniform_after_correction():
 
 
 def sensor(kind="counts", curve="none", band=(7.5, 13.5), **parameters):
-    return ThermalSensor(
-        SignalCurve(kind, curve, {k: tuple(np.atleast_1d(v).tolist()) for k, v in parameters.items()}), band
+    return ThermalCamera(
+        Camera(2, 2, np.eye(3)),
+        np.eye(4),
+        SignalCurve(kind, curve, {k: tuple(np.atleast_1d(v).tolist()) for k, v in parameters.items()}),
+        band,
     )
 
 

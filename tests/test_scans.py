@@ -20,13 +20,14 @@ from thermofusion.mapping.views import NO_POSE, OUTSIDE, SHUTTER, thermal_views
 from thermofusion.physics.signal import counts_to_kelvin
 from thermofusion.scans import FORMATS, open_scan, with_rig, with_thermal
 from thermofusion.scans.check import check_scan, missing_metadata, overlays, verify
+from thermofusion.scans.common import as_thermal
 from thermofusion.scans.formats import apcshelf, azure, ebml, fakenect, jhu
 from thermofusion.scans.native.depth_correction import MetricDepth
 from thermofusion.scans.native.write import excerpt, scan_json, write_scan
 from thermofusion.scans.overlay import edge_overlays
 from thermofusion.scans.pairing import pair_color
 from thermofusion.scans.thermal import flir
-from thermofusion.types import Trajectory
+from thermofusion.types import SignalCurve, Trajectory
 
 
 def same_stream(a, b, times_atol=0.0):
@@ -60,11 +61,11 @@ def test_float_thermal_keeps_its_digits(tmp_path):
     scan = make.tiny_scan()
     degC = [np.linspace(20, 36, 40 * 56, dtype=np.float32).reshape(40, 56)]
     degC[0][0, 0] = np.nan
-    signal = replace(scan.sensor.signal, kind="apparent_degC", curve="none", parameters={})
-    scan = replace(scan, thermal=make.stream(degC, [0.0]), sensor=replace(scan.sensor, signal=signal), references=())
+    camera = replace(scan.thermal.camera, signal=SignalCurve("apparent_degC"))
+    scan = replace(scan, thermal=as_thermal(make.stream(degC, [0.0]), camera), references=())
     back = open_scan(write_scan(scan, tmp_path / "out"))
     same_stream(scan.thermal, back.thermal)
-    assert back.sensor.signal == signal or vars(back.sensor.signal) == vars(signal)
+    assert vars(back.thermal.camera.signal) == vars(camera.signal)
 
 
 def test_original_files_are_copied_byte_for_byte(tmp_path):
@@ -421,15 +422,13 @@ def test_flir_alone_is_no_scan_but_joins_one(tmp_path):
     tree = scan_json(scan)
     camera = tree["cameras"]["thermal"]
     rig.write_text(json.dumps({"cameras": {"thermal": camera}, "extrinsics": tree["extrinsics"]}))
-    bare = replace(
-        scan, thermal=None, sensor=None, references=(), rig=replace(scan.rig, thermal=None, T_thermal_depth=None)
-    )
+    bare = replace(scan, thermal=None, references=())
     frames = flir.read_thermal_frames(file)
     joined = with_thermal(bare, frames, rig, times_s=np.array([0.0, 0.1]))
     verify(joined)
     back = open_scan(write_scan(joined, tmp_path / "native"))
     np.testing.assert_array_equal(back.thermal.load(1), raw + 1)
-    assert back.sensor.signal.curve == "planck"
+    assert back.thermal.camera.signal.curve == "planck"
 
 
 # ---------------------------------------------------------------- composing
@@ -473,15 +472,17 @@ def test_thermal_views_take_poses_at_their_own_time_and_count_the_rest():
     t = np.array([0.0, 0.1, 0.2, 1.0, 1.1])
     T = np.stack([se3_exp(twist * x) for x in t])
     times = [0.05, 0.15, 0.6, 1.05, 2.0, 0.12 + 2]
-    scan = replace(scan, thermal=make.stream([None] * 6, times, [True, False, True, True, True, True]))
-    views, left_out = thermal_views(scan, Trajectory(t, T), 0.5, time_offset_s=-0.02)
+    camera = replace(scan.thermal.camera, time_offset_s=-0.02)
+    stream = make.stream([None] * 6, times, [True, False, True, True, True, True])
+    scan = replace(scan, thermal=as_thermal(stream, scan.thermal.camera))
+    views, left_out = thermal_views(scan, Trajectory(t, T), 0.5, camera)
     assert views.frame.tolist() == [0, 3]
     assert left_out == {SHUTTER: 1, NO_POSE: 1, OUTSIDE: 2}
     np.testing.assert_allclose(views.times_s, [0.03, 1.03])
-    expected = se3_exp(twist * 0.03) @ np.linalg.inv(scan.rig.T_thermal_depth)  # constant twist: exact
+    expected = se3_exp(twist * 0.03) @ np.linalg.inv(scan.thermal.camera.T_thermal_depth)  # constant twist: exact
     np.testing.assert_allclose(views.T_world_thermal[0], expected, atol=1e-12)
     with pytest.raises(ScanError, match="none of 6 thermal frames"):
-        thermal_views(scan, Trajectory(t, T), 0.5, time_offset_s=100.0)
+        thermal_views(scan, Trajectory(t, T), 0.5, replace(camera, time_offset_s=100.0))
 
 
 # ---------------------------------------------------------------- the check
@@ -503,9 +504,11 @@ def test_check_of_a_good_scan_and_of_a_bad_one():
 
 def test_overlay_measures_a_turned_rig():
     scan = make.tiny_scan((160, 120))
-    f = scan.rig.thermal.K[0, 0]
+    camera = scan.thermal.camera
+    f = camera.lens.K[0, 0]
     turn = pose(cv2.Rodrigues(np.array([0, np.arctan(5 / f), 0]))[0], np.zeros(3))  # edges land 5 px too far right
-    wrong = replace(scan, rig=replace(scan.rig, T_thermal_depth=turn @ scan.rig.T_thermal_depth))
+    turned = replace(camera, T_thermal_depth=turn @ camera.T_thermal_depth)
+    wrong = replace(scan, thermal=replace(scan.thermal, camera=turned))
     for s, expected in ((scan, 0), (wrong, -5)):
         thermal = [o for o in edge_overlays(s) if o.camera == "thermal"]
         assert thermal[0].contrast > 1.25
@@ -521,7 +524,7 @@ def test_with_rig_shows_another_rig(tmp_path):
     tree = scan_json(scan)
     tree["extrinsics"]["T_thermal_depth"][0][3] = 0.05
     (tmp_path / "rig.json").write_text(json.dumps({k: tree[k] for k in ("cameras", "extrinsics")}))
-    assert with_rig(scan, tmp_path / "rig.json").rig.T_thermal_depth[0, 3] == 0.05
+    assert with_rig(scan, tmp_path / "rig.json").thermal.camera.T_thermal_depth[0, 3] == 0.05
 
 
 def test_a_rigs_depth_correction_reaches_the_depth_images(tmp_path):
@@ -604,14 +607,16 @@ def test_face(shared_data):
     depth = scan.depth.load(0)
     person = depth[(depth > 0.9) & (depth < 1.35)]
     assert 1.05 < np.median(person) < 1.3
-    K = counts_to_kelvin(scan.sensor.signal, scan.thermal.load(0).astype(float))
+    K = counts_to_kelvin(scan.thermal.camera.signal, scan.thermal.load(0).astype(float))
     assert 303 < np.percentile(K, 98) < 306  # the forehead is the warmest thing there
     person_only = np.where(depth < 1.4, depth, np.nan)
     scan = replace(scan, depth=replace(scan.depth, load=lambda i: person_only))
     (overlay,) = edge_overlays(scan)
     assert max(map(abs, overlay.shift_px)) <= 2  # the outline fits
     other = jhu.read(shared_data("jhu/face"), depth_to_color_x_m=0.025)
-    assert other.rig.T_thermal_depth[0, 3] - scan.rig.T_thermal_depth[0, 3] == pytest.approx(0.05, abs=1e-3)
+    assert (other.thermal.camera.T_thermal_depth - scan.thermal.camera.T_thermal_depth)[0, 3] == pytest.approx(
+        0.05, abs=1e-3
+    )
 
 
 def test_turntable(shared_data):

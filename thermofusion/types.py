@@ -96,21 +96,17 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """The cameras on one frame and where they sit. `color` and `thermal` are optional, each with its extrinsic."""
+    """The cameras that see shape: depth, and colour with its extrinsic (the thermal camera comes with its stream)."""
 
     depth: Camera
-    thermal: Camera | None = None
-    T_thermal_depth: Float | None = None
     color: Camera | None = None
     T_color_depth: Float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("thermal", "color"):
-            camera, key = getattr(self, name), f"T_{name}_depth"
-            if (camera is None) != (getattr(self, key) is None):
-                raise ValueError(f"the {name} camera and {key} must be given together")
-            if camera is not None:
-                object.__setattr__(self, key, check_rigid(getattr(self, key), key))
+        if (self.color is None) != (self.T_color_depth is None):
+            raise ValueError("the color camera and T_color_depth must be given together")
+        if self.T_color_depth is not None:
+            object.__setattr__(self, "T_color_depth", check_rigid(self.T_color_depth, "T_color_depth"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,14 +125,24 @@ class SignalCurve:
 
 
 @dataclass(frozen=True, eq=False)
-class ThermalSensor:
-    """What the radiometry must know of the thermal camera."""
+class ThermalCamera:
+    """The thermal camera: its lens, its signal, where it sits on the rig and what its clock says.
 
-    signal: SignalCurve
+    lens : pinhole and distortion. T_thermal_depth : (4, 4). band_um : wavelengths it sees. netd_K : noise of a pixel,
+    one sigma. time_offset_s : added to a thermal frame's own time to get the depth clock's. psf_sigma_px : optical and
+    pixel point spread; None = not measured. Raises ValueError for a transform that is not rigid.
+    """
+
+    lens: Camera
+    T_thermal_depth: Float
+    signal: SignalCurve = field(default_factory=SignalCurve)
     band_um: tuple[float, float] = (7.5, 13.5)
     netd_K: float = 0.05
-    time_offset_s: float = 0.0  # added to a thermal frame's own time to get the depth clock's time
-    psf_sigma_px: float | None = None  # optical + pixel point spread; None = not measured
+    time_offset_s: float = 0.0
+    psf_sigma_px: float | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "T_thermal_depth", check_rigid(self.T_thermal_depth, "T_thermal_depth"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,6 +206,18 @@ class Stream:
 
 
 @dataclass(frozen=True, eq=False)
+class ThermalStream(Stream):
+    """The thermal camera's images, and the camera that took them."""
+
+    camera: ThermalCamera
+
+    @property
+    def depth_times_s(self) -> Float:
+        """(N,) the frames' times on the depth clock, s."""
+        return self.times_s + self.camera.time_offset_s
+
+
+@dataclass(frozen=True, eq=False)
 class Trajectory:
     """Poses of the depth camera.
 
@@ -234,8 +252,7 @@ class Scan:
     rig: Rig
     depth: Stream
     color: Stream | None = None
-    thermal: Stream | None = None
-    sensor: ThermalSensor | None = None
+    thermal: ThermalStream | None = None
     environment: Environment = field(default_factory=Environment)
     references: tuple[Reference, ...] = ()
     trajectory: Trajectory | None = None

@@ -38,14 +38,12 @@ mesh = load_artifact(options.result / "stages" / "surface.npz").mesh
 seen = load_artifact(options.result / "stages" / "observe.npz").views
 n = min(options.views, len(seen))
 views = ThermalViews(seen.frame[:n], seen.times_s[:n], seen.T_world_thermal[:n])
-assert scan.sensor is not None
-assert scan.rig.thermal is not None
 assert scan.thermal is not None
-converter = SignalConverter(scan.sensor)
+converter = SignalConverter(scan.thermal.camera)
 
 start = time.monotonic()
 rays = SurfaceRays(mesh)
-observe(scan, rays, views, converter.radiance, MappingSection())
+observe(scan.thermal, rays, views, converter.radiance, MappingSection())
 ours_s = time.monotonic() - start
 print(f"ours   {len(mesh)} vertices, {n} views: {ours_s:.2f} s, {1e3 * ours_s / n:.1f} ms a view")
 
@@ -59,7 +57,7 @@ if options.open3d:
         counts = scan.thermal.load(int(i)).astype(np.float32)
         grey = ((counts - counts.min()) / max(float(np.ptp(counts)), 1.0) * 255).astype(np.uint8)
         images.append(o3d.t.geometry.Image(o3d.core.Tensor(np.repeat(grey[..., None], 3, axis=2))))
-    K = o3d.core.Tensor(scan.rig.thermal.K)
+    K = o3d.core.Tensor(scan.thermal.camera.lens.K)
     start = time.monotonic()
     target.project_images_to_albedo(
         images, [K] * n, [o3d.core.Tensor(invert(T)) for T in views.T_world_thermal], 2048, True

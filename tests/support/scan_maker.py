@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from thermofusion.geometry.rigid import pose
+from thermofusion.scans.common import as_thermal
 from thermofusion.types import (
     BlackbodyReference,
     Camera,
@@ -19,7 +20,7 @@ from thermofusion.types import (
     Scan,
     SignalCurve,
     Stream,
-    ThermalSensor,
+    ThermalCamera,
     Trajectory,
 )
 
@@ -79,16 +80,24 @@ def tiny_scan(size=(64, 48), frames=4):
         name="tiny",
         root=Path("memory"),
         format="memory",
-        rig=Rig(depth_cam, thermal_cam, T_thermal_depth, color_cam, T_color_depth),
+        rig=Rig(depth_cam, color_cam, T_color_depth),
         depth=stream([depth(i) for i in range(frames)], times),
         color=stream([color(i) for i in range(frames)], times + 0.004),
-        thermal=stream(
-            [thermal(i) for i in range(n_thermal)],
-            times[:n_thermal] + 0.01,
-            [i != 1 for i in range(n_thermal)],
-        ),
-        sensor=ThermalSensor(
-            SignalCurve("counts", "polynomial", {"coefficients_degC": COEFFICIENTS}), (8.0, 14.0), 0.04, 0.005, 0.7
+        thermal=as_thermal(
+            stream(
+                [thermal(i) for i in range(n_thermal)],
+                times[:n_thermal] + 0.01,
+                [i != 1 for i in range(n_thermal)],
+            ),
+            ThermalCamera(
+                thermal_cam,
+                T_thermal_depth,
+                SignalCurve("counts", "polynomial", {"coefficients_degC": COEFFICIENTS}),
+                (8.0, 14.0),
+                0.04,
+                0.005,
+                0.7,
+            ),
         ),
         environment=Environment(23.0, 22.5, 45.0),
         references=(

@@ -12,7 +12,7 @@ import numpy as np
 from thermofusion.geometry._open3d import o3d
 from thermofusion.geometry.camera import pixel_rays
 from thermofusion.geometry.rigid import interpolate_trajectory, invert, pose, se3_exp
-from thermofusion.types import Camera, Rig, Scan, SignalCurve, Stream, SurfaceMesh, ThermalSensor, Trajectory
+from thermofusion.types import Camera, Rig, Scan, Stream, SurfaceMesh, ThermalCamera, ThermalStream, Trajectory
 
 ROOM_DEGC, SKIN_DEGC, NETD_K = 22.0, 33.0, 0.06
 THERMAL = Camera(
@@ -82,12 +82,10 @@ def make_scan(mesh: SurfaceMesh, trajectory: Trajectory, *, sway: np.ndarray | N
     )
     images = [render(mesh, T, i) for i, T in enumerate(T_world_thermal)]
     places, index = tuple(f"thermal {i}" for i in range(24)), np.arange(24)
-    thermal = Stream(taken, lambda i: images[i], places, index, np.ones(24, bool))
+    camera = ThermalCamera(THERMAL, T_THERMAL_DEPTH, netd_K=NETD_K)
+    thermal = ThermalStream(taken, lambda i: images[i], places, index, np.ones(24, bool), camera)
     depth = Stream(np.zeros(0), lambda i: np.zeros(0), (), np.zeros(0, np.int64), np.zeros(0, bool))
-    sensor = ThermalSensor(SignalCurve("apparent_degC"), netd_K=NETD_K)
-    return Scan(
-        "ellipsoid", Path(), "made", Rig(DEPTH, THERMAL, T_THERMAL_DEPTH), depth, thermal=thermal, sensor=sensor
-    )
+    return Scan("ellipsoid", Path(), "made", Rig(DEPTH), depth, thermal=thermal)
 
 
 def repainted(scan: Scan, paint: Callable[[np.ndarray], np.ndarray]) -> Scan:

@@ -53,10 +53,8 @@ class RigFile:
         """As the method takes it. Raises ScanError if the calibration had no depth camera."""
         if "depth" not in self.cameras:
             raise ScanError("the rig was calibrated without a depth camera", hint="calibrate with depth images")
-        get = self.extrinsics.get
-        thermal = self.cameras.get("thermal") if "T_thermal_depth" in self.extrinsics else None
         color = self.cameras.get("color") if "T_color_depth" in self.extrinsics else None
-        return Rig(self.cameras["depth"], thermal, get("T_thermal_depth"), color, get("T_color_depth"))
+        return Rig(self.cameras["depth"], color, self.extrinsics.get("T_color_depth"))
 
 
 def rig_document(

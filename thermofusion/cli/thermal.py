@@ -221,7 +221,7 @@ def time_offset(
             found = scan_time_offset(recording, max_offset_s=max_s, progress=step)
     except ScanError as e:
         raise ScanError(e.cause, place=e.place or scan, hint=e.hint) from None
-    own = 0.0 if recording.sensor is None else recording.sensor.time_offset_s
+    own = 0.0 if recording.thermal is None else recording.thermal.camera.time_offset_s
     value = {"time_offset_s": found.offset_s, "sigma_s": found.sigma_s, "residual_px": found.residual_px}
     value |= {"thermal_frames": found.frames, "scan_time_offset_s": own}
     text = (

@@ -71,12 +71,12 @@ class Bench:
     @classmethod
     def of(cls, scan: Scan, surface: SurfaceMesh, seen: Seen, temperature: Temperature, recipe: Recipe) -> Bench:
         """All vertices of a finished result. Raises ScanError where there are too few views to leave any out."""
-        assert scan.sensor is not None
-        assert scan.rig.thermal is not None
+        assert scan.thermal is not None
+        camera = scan.thermal.camera
         views = len(np.unique(seen.observations.view))
         if views < 3:
             raise ScanError(f"{views} thermal views see the surface: too few to leave any out", place=scan.root)
-        band, room = Band(*scan.sensor.band_um), room_of(scan.environment, recipe)
+        band, room = Band(*camera.band_um), room_of(scan.environment, recipe)
         model = model_from_recipe(recipe.emissivity, band)
         skin_K = temperature.absolute_degC.astype(np.float64) + ZERO_DEGC_K
         L_reflected = np.full(len(surface), band.radiance(room.reflected_K))
@@ -84,7 +84,7 @@ class Bench:
             L_reflected = surroundings(surface).reflected_radiance(
                 float(L_reflected[0]), band.radiance(skin_K), emissivity=model.hemispherical
             )
-        errors, mapping = error_model(scan.sensor, recipe), recipe.mapping
+        errors, mapping = error_model(camera, recipe), recipe.mapping
         L_air = float(band.radiance(room.air_K))
         rows = remove_air_path(seen.observations, recipe.radiometry.transmission_per_m, L_air)
         well_seen = np.bincount(rows.vertex[rows.cos_angle > WELL_SEEN_COS], minlength=len(surface)) >= 2
@@ -98,7 +98,7 @@ class Bench:
             straight | ~straight_seen[rows.vertex],
             len(seen.views),
             seen.blackbodies,
-            scan.rig.thermal,
+            camera.lens,
             band,
             model,
             L_reflected,

@@ -152,13 +152,13 @@ def validate_result(
     assert result.surface is not None
     assert result.seen is not None
     assert result.temperature is not None
-    assert scan.sensor is not None
+    assert scan.thermal is not None
     surface, mesh, step = result.surface.mesh, result.temperature.mesh, progress
     dense = Bench.of(scan, surface, result.seen, result.temperature, recipe)
     bench = dense.sample(sample)
     left = bench.predictions(folds, step)
     notes: list[str] = []
-    psf_px = scan.sensor.psf_sigma_px
+    psf_px = scan.thermal.camera.psf_sigma_px
     if psf_px is None:
         psf_px = ErrorModel.psf_sigma_px
         notes.append(f"the thermal camera's point spread is not known: {psf_px} px assumed")
@@ -209,14 +209,16 @@ def _with_motion(
     assert result.surface is not None
     assert result.seen is not None
     assert result.temperature is not None
-    assert scan.sensor is not None
+    assert scan.thermal is not None
     surface, seen = result.surface.mesh, result.seen
-    motion = view_corrections(scan, surface, seen.views, result.alignment, progress=progress)
+    motion = view_corrections(scan.thermal, surface, seen.views, result.alignment, progress=progress)
     report = replace(report, messages=(*report.messages, *motion.messages))
     if not motion.kept:
         return report
     views = replace(seen.views, T_world_thermal=motion.T_world_thermal)
-    rows = observe(scan, SurfaceRays(surface), views, SignalConverter(scan.sensor).radiance, recipe.mapping)
+    rows = observe(
+        scan.thermal, SurfaceRays(surface), views, SignalConverter(scan.thermal.camera).radiance, recipe.mapping
+    )
     bench = Bench.of(scan, surface, replace(seen, views=views, observations=rows), result.temperature, recipe)
     left = bench.sample(report.vertices).predictions(folds, progress)
     before, after = report.overall.rmse_K, Statistics.of(left.residual_K).rmse_K

@@ -14,12 +14,11 @@ from functools import partial
 
 import numpy as np
 
-from ..errors import ScanError
 from ..geometry.rigid import invert, se3_exp
 from ..rig.align import AlignmentResult
 from ..rig.outlines import OutlineResidual, OutlineView, measure_outline, reach_px, read_outlines, weights_about_median
 from ..robust import mad_sigma
-from ..types import Bool, Float, Scan, SurfaceMesh, ThermalViews
+from ..types import Bool, Float, SurfaceMesh, ThermalStream, ThermalViews
 
 PRIOR_ROTATION_DEG = 0.15
 PRIOR_TRANSLATION_M = 0.004  # breathing and sway of a standing person
@@ -51,7 +50,7 @@ class MotionResult:
 
 
 def view_corrections(
-    scan: Scan,
+    stream: ThermalStream,
     mesh: SurfaceMesh,
     views: ThermalViews,
     alignment: AlignmentResult | None = None,
@@ -64,13 +63,11 @@ def view_corrections(
     ----------
     views : the aligned views. alignment : gives the outline's common width; None: its median is used.
 
-    Raises ScanError if the scan has no thermal stream.
+    Raises ScanError for an image that cannot be read.
     """
-    camera = scan.rig.thermal
-    if camera is None:
-        raise ScanError("the scan has no thermal stream", place=scan.root, hint="there is nothing to correct")
+    camera = stream.camera.lens
     report = None if progress is None else partial(progress, "motion")
-    outlines, contrast = read_outlines(scan, mesh, views.frame.tolist(), views.T_world_thermal, report)
+    outlines, contrast = read_outlines(stream, mesh, views.frame.tolist(), views.T_world_thermal, report)
     if contrast is None:
         return _none(views, "the outline does not stand out from the background in the thermal images")
     T_thermal_world = invert(views.T_world_thermal)

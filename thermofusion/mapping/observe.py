@@ -19,7 +19,7 @@ from ..geometry.camera import project, viewing_cosine
 from ..geometry.rays import RayScene
 from ..geometry.rigid import invert, transform_points
 from ..recipe import MappingSection
-from ..types import Bool, Camera, Float, Float32, Int, Observations, Scan, SurfaceMesh, ThermalViews
+from ..types import Bool, Camera, Float, Float32, Int, Observations, SurfaceMesh, ThermalStream, ThermalViews
 
 EDGE_CAP_PX = 32.0  # distances to a silhouette are stored up to here; nothing depends on larger ones
 NORMAL_OFFSET_M = 0.003  # a ray to the eye starts this far off the surface, so that noise does not shadow itself
@@ -64,7 +64,7 @@ class SurfaceRays:
 
 
 def observe(
-    scan: Scan,
+    stream: ThermalStream,
     surface: SurfaceRays,
     views: ThermalViews,
     to_radiance: Callable[[NDArray], Float32],
@@ -77,15 +77,11 @@ def observe(
     to_radiance : a stored thermal image -> (H, W) float32 in-band radiance, NaN where the pixel is unusable.
     Raises ScanError if no view sees the surface.
     """
-    camera, stream = scan.rig.thermal, scan.thermal
-    if camera is None or stream is None:
-        raise ScanError(
-            "the scan has no thermal stream", place=scan.root, hint="record one, or see `thermofusion check`"
-        )
+    lens = stream.camera.lens
 
     def one(view: int) -> Observations:
         image = to_radiance(stream.load(int(views.frame[view])))
-        return observe_view(surface, camera, views.T_world_thermal[view], image, mapping, view=view)
+        return observe_view(surface, lens, views.T_world_thermal[view], image, mapping, view=view)
 
     parts: list[Observations] = []
     with ThreadPoolExecutor(max_workers=3) as pool:
@@ -97,7 +93,6 @@ def observe(
     if not sum(len(p) for p in parts):
         raise ScanError(
             "no thermal view sees the surface",
-            place=scan.root,
             hint="check T_thermal_depth and the thermal clock with `thermofusion check`",
         )
     return Observations(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in columns})

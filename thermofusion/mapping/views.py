@@ -6,7 +6,7 @@ import numpy as np
 
 from ..errors import ScanError
 from ..geometry.rigid import interpolate_trajectory, invert
-from ..types import Float, Scan, ThermalViews, Trajectory, check_rigid
+from ..types import Scan, ThermalCamera, ThermalViews, Trajectory
 
 # Why a thermal frame did not enter the result: the keys of `thermal_views`' counts.
 SHUTTER = "shutter"  # taken during, or just after, a shutter correction, or rejected by the reader
@@ -15,28 +15,21 @@ NO_POSE = "no pose"  # inside a gap of the trajectory longer than allowed: track
 
 
 def thermal_views(
-    scan: Scan,
-    trajectory: Trajectory,
-    max_pose_gap_s: float,
-    T_thermal_depth: Float | None = None,
-    time_offset_s: float | None = None,
+    scan: Scan, trajectory: Trajectory, max_pose_gap_s: float, camera: ThermalCamera | None = None
 ) -> tuple[ThermalViews, dict[str, int]]:
     """The thermal frames that have a pose, and how many were left out, by reason.
 
-    A thermal frame's time on the depth clock is its own time + `time_offset_s` (the sensor's by default); there the
-    trajectory is interpolated on SE(3), and T_world_thermal = T_world_depth @ T_depth_thermal.
+    A thermal frame's time on the depth clock is its own time + `time_offset_s`; there the trajectory is interpolated
+    on SE(3), and T_world_thermal = T_world_depth @ T_depth_thermal, (M, 4, 4).
 
-    T_thermal_depth, time_offset_s : replace the scan's own (refined ones of the cross-calibration).
-    Raises ScanError if the scan has no thermal stream, or if not one thermal frame is left.
+    camera : the refined one, in place of the scan's own. Raises ScanError if the scan has no thermal stream, or if not
+    one thermal frame is left.
     """
-    stream, rig = scan.thermal, scan.rig
-    extrinsic = rig.T_thermal_depth if T_thermal_depth is None else T_thermal_depth
-    if stream is None or extrinsic is None or len(stream) == 0:
+    stream = scan.thermal
+    if stream is None or len(stream) == 0:
         raise ScanError("the scan has no thermal frames", place=scan.root)
-    if time_offset_s is None:
-        time_offset_s = 0.0 if scan.sensor is None else scan.sensor.time_offset_s
-
-    times_s = stream.times_s + time_offset_s
+    camera = stream.camera if camera is None else camera
+    times_s = stream.times_s + camera.time_offset_s
     T_world_depth, valid = interpolate_trajectory(trajectory, times_s, max_gap_s=max_pose_gap_s)
     slack_s = 0.5 * float(np.median(np.diff(trajectory.times_s))) if len(trajectory) > 1 else 1e-3
     t = trajectory.times_s
@@ -54,6 +47,6 @@ def thermal_views(
             place=scan.root,
             hint=f"thermal runs {times_s[0]:.3f} to {times_s[-1]:.3f} s, the trajectory {t[0]:.3f} to {t[-1]:.3f} s",
         )
-    T_depth_thermal = invert(check_rigid(extrinsic, "T_thermal_depth"))
+    T_depth_thermal = invert(camera.T_thermal_depth)
     frame = np.flatnonzero(good).astype(np.int32)
     return ThermalViews(frame, times_s[good], T_world_depth[good] @ T_depth_thermal), left_out

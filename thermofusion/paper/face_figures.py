@@ -377,8 +377,7 @@ def _thermal_picture(s: Sitting, scale: Scale) -> UInt8:
     from ..physics.band import ZERO_DEGC_K
     from ..physics.signal import SignalConverter
 
-    assert s.scan.sensor is not None
     assert s.scan.thermal is not None
-    converter = SignalConverter(s.scan.sensor)
+    converter = SignalConverter(s.scan.thermal.camera)
     L = converter.radiance(s.scan.thermal.load(0)).astype(np.float64)
     return palettes.apply(converter.band.temperature_K(L) - ZERO_DEGC_K, scale.palette, scale.lo, scale.hi)

@@ -97,12 +97,12 @@ def compared(
     """
     assert result.seen is not None
     assert result.temperature is not None
-    assert scan.sensor is not None
+    assert scan.thermal is not None
     from ..temperature.solve import room_of
 
     models = given or SKIN
     rows = result.seen.observations.select(result.seen.observations.edge_px >= EDGE_PX)
-    band = Band(*scan.sensor.band_um)
+    band = Band(*scan.thermal.camera.band_um)
     room_K = room_of(scan.environment, recipe).reflected_K
     cos = rows.cos_angle.astype(np.float64)
     L = rows.radiance.astype(np.float64)

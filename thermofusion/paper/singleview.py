@@ -92,12 +92,11 @@ def _where_seen(model: EmissivityModel, cos: Float) -> Float:
 def view_of(result: Result, scan: Scan, room_degC: float, index: int = 0) -> View:
     """One of a result's thermal views."""
     assert result.seen is not None
-    assert scan.rig.thermal is not None
-    assert scan.sensor is not None
+    assert scan.thermal is not None
     seen, surface = result.seen, result.mesh.surface
     rows = seen.observations.select(seen.observations.view == index)
     T = seen.views.T_world_thermal[index]
-    band = Band(*scan.sensor.band_um)
+    band = Band(*scan.thermal.camera.band_um)
 
     def column(values: NDArray) -> Float:
         out = np.full(len(surface), np.nan)
@@ -108,7 +107,7 @@ def view_of(result: Result, scan: Scan, room_degC: float, index: int = 0) -> Vie
     axis = np.abs(surface.normals[rows.vertex].astype(np.float64) @ T[:3, 2])
     return View(
         surface,
-        scan.rig.thermal,
+        scan.thermal.camera.lens,
         T,
         band,
         room_degC,
@@ -176,12 +175,11 @@ def flat_field(scan: Scan, radiometry: Path, room_px: tuple[slice, slice], room_
     picture is shifted until it reads that.
     """
     assert scan.thermal is not None
-    assert scan.sensor is not None
     z = [np.asarray(loadmat(radiometry / f"0301_z{i}.mat")[f"z{i}"], np.float64) for i in (1, 2, 3, 4)]
-    converter = SignalConverter(scan.sensor)
+    converter = SignalConverter(scan.thermal.camera)
     T = converter.band.temperature_K(converter.radiance(scan.thermal.load(0)).astype(np.float64)) - ZERO_DEGC_K
     flat = T + z[0] + T * (z[1] + T * (z[2] + T * z[3]))
     shift = room_degC - float(np.nanmedian(flat[room_px]))
     image = (flat + shift).astype(np.float32)
-    stream = replace(scan.thermal, load=lambda i: image)
-    return replace(scan, thermal=stream, sensor=replace(scan.sensor, signal=SignalCurve())), shift
+    camera = replace(scan.thermal.camera, signal=SignalCurve())
+    return replace(scan, thermal=replace(scan.thermal, load=lambda i: image, camera=camera)), shift

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ScanError
-from ..types import Float, Float32, SignalCurve, ThermalSensor
+from ..types import Float, Float32, SignalCurve, ThermalCamera
 from .band import TABLE_K, ZERO_DEGC_K, Band
 
 MAX_UNUSABLE = 0.01  # share of an image's pixels that may lie off the radiometric curve (dead pixels)
@@ -22,16 +22,16 @@ MAX_UNUSABLE = 0.01  # share of an image's pixels that may lie off the radiometr
 class SignalConverter:
     """Stored thermal pixels to apparent in-band radiance.
 
-    Counts go through a look-up table of all 65,536 values, made once. Values where the sensor's curve leaves its
+    Counts go through a look-up table of all 65,536 values, made once. Values where the camera's curve leaves its
     longest strictly monotone stretch, or 150-1500 K, are off the curve: NaN (dead pixels), an error when more
     than 1 % of an image is.
 
     Raises ScanError when the curve is incomplete or usable nowhere.
     """
 
-    def __init__(self, sensor: ThermalSensor) -> None:
-        self.signal = sensor.signal
-        self.band = Band(*sensor.band_um)
+    def __init__(self, camera: ThermalCamera) -> None:
+        self.signal = camera.signal
+        self.band = Band(*camera.band_um)
         self._lut: Float32 | None = None
         self.counts_range: tuple[int, int] | None = None
         if self.signal.kind == "counts":
@@ -89,7 +89,7 @@ class SignalConverter:
 
 
 def counts_to_kelvin(signal: SignalCurve, counts: Float) -> Float:
-    """Apparent temperature of counts through the sensor's curve, K; NaN where the curve gives none (paper Eq. 1)."""
+    """Apparent temperature of counts through the camera's curve, K; NaN where the curve gives none (paper Eq. 1)."""
     p, place = signal.parameters, "cameras.thermal.signal.curve"
     try:
         with np.errstate(all="ignore"):

@@ -146,7 +146,7 @@ def _surface(s: FusionResult) -> dict[str, Any]:
 
 
 def _alignment(scan: Scan, a: AlignmentResult) -> dict[str, Any]:
-    start = scan.rig.T_thermal_depth
+    start = None if scan.thermal is None else scan.thermal.camera.T_thermal_depth
     return {
         "changed": a.changed,
         "converged": a.converged,

@@ -95,17 +95,17 @@ def align_thermal(
 
     Raises ScanError if the scan has no thermal stream, or an image cannot be read.
     """
-    stream, camera, rig, sensor = scan.thermal, scan.rig.thermal, scan.rig.T_thermal_depth, scan.sensor
-    if stream is None or camera is None or rig is None or sensor is None:
+    stream = scan.thermal
+    if stream is None:
         raise ScanError("the scan has no thermal stream", place=scan.root, hint="there is nothing to align")
-    start = _State(rig, sensor.time_offset_s)
+    camera, start = stream.camera.lens, _State(stream.camera.T_thermal_depth, stream.camera.time_offset_s)
     if not recipe.crosscal.align:
         return _unchanged(start, "alignment is switched off by the recipe")
     frames = _frames(stream, trajectory, start, recipe.input.max_pose_gap_ms / 1e3)
     T_world_depth, _ = interpolate_trajectory(trajectory, stream.times_s[frames] + start.time_offset_s)
     report = None if progress is None else partial(progress, "align")
     T_world_thermal = T_world_depth @ invert(start.T_thermal_depth)
-    outlines, contrast = read_outlines(scan, mesh, frames.tolist(), T_world_thermal, report)
+    outlines, contrast = read_outlines(stream, mesh, frames.tolist(), T_world_thermal, report)
     if len(outlines) < MIN_VIEWS:
         return _unchanged(start, f"fewer than {MIN_VIEWS} thermal views show an outline that could be used")
     begin = start
@@ -115,7 +115,7 @@ def align_thermal(
             rotation = shift[::-1] / camera.focal_px * [-1, 1]
             begin = start.moved(np.concatenate([rotation, np.zeros(6)]))
             T_world_thermal = T_world_depth @ invert(begin.T_thermal_depth)
-            outlines, contrast = read_outlines(scan, mesh, frames.tolist(), T_world_thermal, report)
+            outlines, contrast = read_outlines(stream, mesh, frames.tolist(), T_world_thermal, report)
     if contrast is None or len(outlines) < MIN_VIEWS:
         return _unchanged(start, "the outline does not stand out from the background in the thermal images")
     times_s = stream.times_s[frames[[v.row for v in outlines]]]

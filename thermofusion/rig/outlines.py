@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ScanError
 from ..geometry.outline import Contour, OutlineCaster, project_contour
 from ..geometry.rigid import invert
 from ..physics.signal import SignalConverter
 from ..robust import TUKEY, mad_sigma, tukey_weight
-from ..types import Camera, Float, Float32, Scan, SurfaceMesh
+from ..types import Camera, Float, Float32, SurfaceMesh, ThermalStream
 from .edges import find_edges, smooth_image
 
 MAX_POINTS = 400  # contour points used in a view
@@ -65,7 +64,7 @@ class OutlineResidual:
 
 
 def read_outlines(
-    scan: Scan,
+    stream: ThermalStream,
     mesh: SurfaceMesh,
     frames: Sequence[int],
     T_world_thermal: Float,
@@ -73,12 +72,10 @@ def read_outlines(
 ) -> tuple[tuple[OutlineView, ...], Contrast | None]:
     """Images and model outlines of thermal frames at poses (N, 4, 4), and how the outline shows in them.
 
-    The contrast is None where nothing stands out. Raises ScanError without a thermal stream.
+    The contrast is None where nothing stands out. Raises ScanError for an image that cannot be read.
     """
-    stream, camera, sensor = scan.thermal, scan.rig.thermal, scan.sensor
-    if stream is None or camera is None or sensor is None:
-        raise ScanError("the scan has no thermal stream", place=scan.root, hint="there is nothing to align")
-    converter, caster = SignalConverter(sensor), OutlineCaster(mesh, camera)
+    lens = stream.camera.lens
+    converter, caster = SignalConverter(stream.camera), OutlineCaster(mesh, lens)
     views: list[OutlineView] = []
     for row, frame in enumerate(frames):
         contour = caster.contour(T_world_thermal[row])
@@ -94,8 +91,8 @@ def read_outlines(
     if not np.isfinite(level).any():
         return tuple(views), None
     band = converter.band
-    noise = sensor.netd_K * float(band.d_radiance_dT(band.temperature_K(np.nanmedian(level))))
-    return tuple(views), _contrast(camera, views, invert(T_world_thermal), noise)
+    noise = stream.camera.netd_K * float(band.d_radiance_dT(band.temperature_K(np.nanmedian(level))))
+    return tuple(views), _contrast(lens, views, invert(T_world_thermal), noise)
 
 
 def _contrast(camera: Camera, views: Sequence[OutlineView], T_thermal_world: Float, noise: float) -> Contrast | None:

@@ -17,7 +17,7 @@ from ..geometry.camera import project
 from ..geometry.rigid import rotation_angle_deg, transform_points
 from ..physics.band import ZERO_DEGC_K
 from ..physics.signal import SignalConverter
-from ..types import Camera, Float, Scan, Stream, UInt8
+from ..types import Camera, Float, Scan, Stream, ThermalStream, UInt8
 from .overlay import OVERLAY_FRAMES, edge_overlays
 from .pairing import nearest_in_time
 
@@ -125,10 +125,9 @@ def _sample(stream: Stream, sample: int, *, usable_only: bool = True) -> list[in
 def _time_faults(scan: Scan, sample: int) -> None:
     t = scan.depth.times_s
     slack = 1.0 if len(t) < 2 else 0.5 * float(np.median(np.diff(t))) + 1e-3
-    offset = 0.0 if scan.sensor is None else scan.sensor.time_offset_s
     others = {
         "colour": None if scan.color is None else scan.color.times_s,
-        "thermal": None if scan.thermal is None else scan.thermal.times_s + offset,
+        "thermal": None if scan.thermal is None else scan.thermal.depth_times_s,
         "trajectory": None if scan.trajectory is None else scan.trajectory.times_s,
     }
     for name, u in others.items():
@@ -156,8 +155,9 @@ def _depth_faults(scan: Scan, sample: int) -> None:
             place=scan.root,
             hint="set cameras.depth.depth_unit_m (0.001 for millimetres)",
         )
-    if scan.rig.thermal is not None and scan.rig.T_thermal_depth is not None and scan.thermal is not None:
-        seen = [_share_seen(d, scan.rig.depth, scan.rig.thermal, scan.rig.T_thermal_depth) for d in frames]
+    if scan.thermal is not None:
+        camera = scan.thermal.camera
+        seen = [_share_seen(d, scan.rig.depth, camera.lens, camera.T_thermal_depth) for d in frames]
         if max(seen) == 0:
             raise ScanError(
                 "no depth point of the sampled frames projects into the thermal image: the cameras share no view",
@@ -190,13 +190,11 @@ def _color_faults(scan: Scan, sample: int) -> None:
 def _thermal_faults(scan: Scan, sample: int) -> None:
     if scan.thermal is None:
         return
-    if scan.sensor is None:
-        raise ScanError("the thermal camera has no radiometry", place=scan.root, hint="state cameras.thermal.signal")
     if not scan.thermal.usable.any():
         raise ScanError("every thermal frame is marked as taken during a shutter correction", place=scan.root)
-    convert = SignalConverter(scan.sensor)
+    convert = SignalConverter(scan.thermal.camera)
     for i in _sample(scan.thermal, sample):
-        degC = _apparent_degC(scan, convert, i)
+        degC = _apparent_degC(scan.thermal, convert, i)
         if not np.isfinite(degC).any():
             raise ScanError("the thermal frame has no measurement at all", place=scan.thermal.places[i])
         median = float(np.nanmedian(degC))
@@ -208,10 +206,9 @@ def _thermal_faults(scan: Scan, sample: int) -> None:
             )
 
 
-def _apparent_degC(scan: Scan, convert: SignalConverter, i: int) -> Float:
+def _apparent_degC(stream: ThermalStream, convert: SignalConverter, i: int) -> Float:
     """Apparent temperature of every 4th pixel of a thermal frame."""
-    assert scan.thermal is not None
-    radiance = convert.radiance(scan.thermal.load(i), scan.thermal.places[i])
+    radiance = convert.radiance(stream.load(i), stream.places[i])
     return convert.band.temperature_K(radiance[::4, ::4]) - ZERO_DEGC_K
 
 
@@ -230,7 +227,7 @@ def check_scan(scan: Scan, sample: int = 9) -> CheckReport:
         for name, stream, camera in (
             ("depth", scan.depth, scan.rig.depth),
             ("color", scan.color, scan.rig.color),
-            ("thermal", scan.thermal, scan.rig.thermal),
+            ("thermal", scan.thermal, None if scan.thermal is None else scan.thermal.camera.lens),
         )
         if stream is not None and camera is not None
     }
@@ -269,13 +266,13 @@ def overlays(scan: Scan, count: int = OVERLAY_FRAMES) -> dict[str, UInt8]:
 def missing_metadata(scan: Scan) -> tuple[str, ...]:
     """What the recording does not state and a quantitative result should."""
     e = scan.environment
-    thermal = scan.thermal is not None
+    thermal, camera = scan.thermal is not None, None if scan.thermal is None else scan.thermal.camera
     entries = (
         (thermal and e.reflected_degC is None, "environment.reflected_degC (temperature of the surroundings)"),
         (thermal and e.air_degC is None, "environment.air_degC"),
         (thermal and e.relative_humidity_pct is None, "environment.relative_humidity_pct"),
         (thermal and not scan.references, "references (without one the level is relative, not absolute)"),
-        (thermal and scan.sensor is not None and scan.sensor.psf_sigma_px is None, "cameras.thermal.psf_sigma_px"),
+        (camera is not None and camera.psf_sigma_px is None, "cameras.thermal.psf_sigma_px"),
         (scan.recorded_at is None, "recorded_at"),
         ("posture" not in scan.subject, "subject.posture"),
         ("acclimatisation_min" not in scan.subject, "subject.acclimatisation_min"),
@@ -311,8 +308,7 @@ def _sync_findings(scan: Scan) -> list[Finding]:
         text = f"nearest colour frame {np.median(dt) * 1e3:+.1f} ms (median), {np.abs(dt).max() * 1e3:.1f} ms at most"
         found.append(Finding(severity, "sync colour", text))
     if scan.thermal is not None:
-        offset = 0.0 if scan.sensor is None else scan.sensor.time_offset_s
-        t = scan.thermal.times_s + offset
+        t, offset = scan.thermal.depth_times_s, scan.thermal.camera.time_offset_s
         outside = int(((t < scan.depth.times_s[0] - 0.1) | (t > scan.depth.times_s[-1] + 0.1)).sum())
         if outside:
             found.append(Finding("warning", "sync thermal", f"{outside} of {len(t)} frames lie outside depth's time"))
@@ -325,10 +321,10 @@ def _sync_findings(scan: Scan) -> list[Finding]:
 
 def _extrinsic_findings(scan: Scan) -> list[Finding]:
     found = []
-    for name in ("thermal", "color"):
-        T = getattr(scan.rig, f"T_{name}_depth")
-        if T is None:
-            continue
+    extrinsics = {} if scan.thermal is None else {"thermal": scan.thermal.camera.T_thermal_depth}
+    if scan.rig.T_color_depth is not None:
+        extrinsics["color"] = scan.rig.T_color_depth
+    for name, T in extrinsics.items():
         baseline, angle = float(np.linalg.norm(T[:3, 3])), float(rotation_angle_deg(T))
         text = f"{baseline * 1e3:.0f} mm and {angle:.1f} deg from depth"
         odd = baseline > MAX_BASELINE_M or angle > MAX_ANGLE_DEG
@@ -347,13 +343,12 @@ def _measure(scan: Scan, sample: int) -> dict:
         "depth_coverage": float(np.mean([np.isfinite(d).mean() for d in depth])),
         "median_depth_m": float(np.median(measured)),
     }
-    if scan.thermal is not None and scan.sensor is not None:
-        convert = SignalConverter(scan.sensor)
-        degC = np.stack([_apparent_degC(scan, convert, i) for i in _sample(scan.thermal, sample)])
+    if scan.thermal is not None:
+        camera, convert = scan.thermal.camera, SignalConverter(scan.thermal.camera)
+        degC = np.stack([_apparent_degC(scan.thermal, convert, i) for i in _sample(scan.thermal, sample)])
         out["thermal_degC"] = tuple(float(x) for x in np.nanpercentile(degC, [1, 50, 99]))
-        if scan.rig.thermal is not None and scan.rig.T_thermal_depth is not None:
-            camera, T = scan.rig.thermal, scan.rig.T_thermal_depth
-            out["seen_by_thermal"] = float(np.mean([_share_seen(d, scan.rig.depth, camera, T) for d in depth]))
+        seen = [_share_seen(d, scan.rig.depth, camera.lens, camera.T_thermal_depth) for d in depth]
+        out["seen_by_thermal"] = float(np.mean(seen))
     shifts: dict[str, list[tuple[float, float]]] = {}
     for o in edge_overlays(scan, OVERLAY_FRAMES):
         if o.contrast >= MIN_OVERLAY_CONTRAST:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..errors import ScanError
 from ..files.reading import claimed_size, decode_image, depth_from_raw, read_bytes
-from ..types import Camera, Float, Rig, Stream
+from ..types import Camera, Float, Rig, Stream, ThermalCamera, ThermalStream
 
 Kind = Literal["depth", "color", "thermal"]
 ASSUMED_RATE_HZ = 30.0  # of recordings that carry no times
@@ -133,22 +133,22 @@ def make_camera(
         raise ScanError(str(e), place=place) from None
 
 
-def make_rig(
-    depth: Camera,
-    color: Camera | None = None,
-    T_color_depth: NDArray | None = None,
-    thermal: Camera | None = None,
-    T_thermal_depth: NDArray | None = None,
-    *,
-    place: object,
-) -> Rig:
-    """A `Rig`, its faults as ScanError with the place; a colour camera without an extrinsic coincides with depth."""
+def make_rig(depth: Camera, color: Camera | None = None, T_color_depth: NDArray | None = None, *, place: object) -> Rig:
+    """A `Rig`, its faults as ScanError with the place; a colour camera without an extrinsic coincides with depth.
+
+    T_color_depth : (4, 4), rigid.
+    """
     if color is not None and T_color_depth is None:
         T_color_depth = np.eye(4)
     try:
-        return Rig(depth, thermal, T_thermal_depth, color, T_color_depth)
+        return Rig(depth, color, T_color_depth)
     except ValueError as e:
         raise ScanError(str(e), place=place) from None
+
+
+def as_thermal(stream: Stream, camera: ThermalCamera) -> ThermalStream:
+    """A stream of thermal images with the camera that took them."""
+    return ThermalStream(stream.times_s, stream.load, stream.places, stream.index, stream.usable, camera)
 
 
 # ---------------------------------------------------------------- poses

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..geometry.camera import project
 from ..geometry.rigid import interpolate_trajectory, invert, transform_points
-from ..types import Bool, Camera, Float, Scan, UInt8
+from ..types import Bool, Camera, Float, Scan, Stream, UInt8
 from .pairing import nearest_in_time
 
 OVERLAY_FRAMES = 3
@@ -41,15 +42,11 @@ def edge_overlays(scan: Scan, count: int = OVERLAY_FRAMES) -> list[Overlay]:
     The depth frame nearest in time is used; where the scan has a trajectory, the motion between the two is applied.
     """
     found = []
-    for name in ("thermal", "color"):
-        stream, camera, T = getattr(scan, name), getattr(scan.rig, name), getattr(scan.rig, f"T_{name}_depth")
-        if stream is None or camera is None or T is None:
-            continue
+    for name, stream, camera, T, times_s in _others(scan):
         rows = np.flatnonzero(stream.usable)
         picks = rows[np.unique(np.linspace(0, len(rows) - 1, min(count, len(rows))).round().astype(int))]
-        offset = scan.sensor.time_offset_s if name == "thermal" and scan.sensor is not None else 0.0
         for i in picks.tolist():
-            t = stream.times_s[i] + offset
+            t = times_s[i]
             k = int(nearest_in_time(np.array([t]), scan.depth.times_s)[0][0])
             T_other_depth = T @ _motion(scan, t, scan.depth.times_s[k])
             grey = to_grey(stream.load(i))
@@ -58,6 +55,15 @@ def edge_overlays(scan: Scan, count: int = OVERLAY_FRAMES) -> list[Overlay]:
             picture = _draw(grey if name == "thermal" else stream.load(i), edges)
             found.append(Overlay(f"overlay-{name}-{int(stream.index[i]):06d}", name, picture, shift, contrast))
     return found
+
+
+def _others(scan: Scan) -> Iterator[tuple[str, Stream, Camera, Float, Float]]:
+    """The cameras beside depth: name, images, lens, T_other_depth, and the images' times on the depth clock."""
+    if scan.thermal is not None:
+        camera = scan.thermal.camera
+        yield "thermal", scan.thermal, camera.lens, camera.T_thermal_depth, scan.thermal.depth_times_s
+    if scan.color is not None and scan.rig.color is not None and scan.rig.T_color_depth is not None:
+        yield "color", scan.color, scan.rig.color, scan.rig.T_color_depth, scan.color.times_s
 
 
 def depth_edges(depth_m: NDArray) -> Bool:

@@ -149,7 +149,7 @@ def _voxel(scan: Scan, survey: Survey, recipe: Recipe) -> float:
     if recipe.fusion.voxel_mm != "auto":
         return recipe.fusion.voxel_mm / 1e3
     z = survey.median_range_m
-    footprint = 0.0 if scan.rig.thermal is None else z / scan.rig.thermal.focal_px
+    footprint = 0.0 if scan.thermal is None else z / scan.thermal.camera.lens.focal_px
     return float(
         np.clip(max(VOXEL_PER_NOISE * survey.noise_m_at_1m * z**2, VOXEL_PER_FOOTPRINT * footprint), *VOXEL_BOUNDS_M)
     )

@@ -31,8 +31,8 @@ from ..types import (
     OutputMode,
     Scan,
     SurfaceMesh,
+    ThermalCamera,
     ThermalMesh,
-    ThermalSensor,
     ThermalViews,
     Trajectory,
     VertexFlag,
@@ -79,20 +79,16 @@ def see(
     progress: Callable[[int, int], None] | None = None,
 ) -> Seen:
     """Project all thermal views onto the surface, with the aligned rig and clock."""
-    assert scan.sensor is not None
-    views, left_out = thermal_views(
-        scan,
-        trajectory,
-        recipe.input.max_pose_gap_ms / 1e3,
-        T_thermal_depth=alignment.T_thermal_depth,
-        time_offset_s=alignment.time_offset_s,
-    )
+    assert scan.thermal is not None
+    stream = scan.thermal
+    camera = replace(stream.camera, T_thermal_depth=alignment.T_thermal_depth, time_offset_s=alignment.time_offset_s)
+    views, left_out = thermal_views(scan, trajectory, recipe.input.max_pose_gap_ms / 1e3, camera)
     motion = None
     if recipe.crosscal.motion:
-        motion = view_corrections(scan, surface, views, alignment)
+        motion = view_corrections(stream, surface, views, alignment)
         views = replace(views, T_world_thermal=motion.T_world_thermal)
-    converter = SignalConverter(scan.sensor)
-    observations = observe(scan, SurfaceRays(surface), views, converter.radiance, recipe.mapping, progress=progress)
+    converter = SignalConverter(stream.camera)
+    observations = observe(stream, SurfaceRays(surface), views, converter.radiance, recipe.mapping, progress=progress)
     return Seen(views, left_out, observations, _read_blackbodies(scan, views, converter, recipe), motion)
 
 
@@ -173,9 +169,9 @@ def measure(
 
     axes : which way is up and where the front is, for the mesh's metadata (`export.view_axes`).
     """
-    assert scan.sensor is not None
-    assert scan.rig.thermal is not None
-    band, room = Band(*scan.sensor.band_um), room_of(scan.environment, recipe)
+    assert scan.thermal is not None
+    camera = scan.thermal.camera
+    band, room = Band(*camera.band_um), room_of(scan.environment, recipe)
     model = model_from_recipe(recipe.emissivity, band)
     L_room = float(band.radiance(room.reflected_K))
     observations = remove_air_path(
@@ -192,7 +188,7 @@ def measure(
         return around.reflected_radiance(L_room, skin, emissivity=model.hemispherical)
 
     L_reflected = reflected(np.full(len(surface), np.median(observations.radiance), np.float32))
-    errors = error_model(scan.sensor, recipe)
+    errors = error_model(camera, recipe)
     calibration, notes = _calibrate(scan, surface, seen, witnesses, recipe, model, band, L_reflected, errors)
 
     def blended(settings: RadiometrySection, *, with_uncertainty: bool = True) -> BlendResult:
@@ -270,7 +266,6 @@ def _read_blackbodies(
 ) -> tuple[BlackbodyReading, ...]:
     """Every blackbody in every view that it was recorded in."""
     assert scan.thermal is not None
-    assert scan.sensor is not None
     L_room = float(converter.band.radiance(room_of(scan.environment, recipe).reflected_K))
     readings = []
     for reference in scan.references:
@@ -287,7 +282,7 @@ def _read_blackbodies(
                 emissivity=reference.emissivity,
                 L_reflected=L_room,
                 band=converter.band,
-                netd_K=scan.sensor.netd_K,
+                netd_K=scan.thermal.camera.netd_K,
             )
             if reading is not None:
                 readings.append(reading)
@@ -314,7 +309,7 @@ def _contacts(scan: Scan, surface: SurfaceMesh, band: Band) -> list[ContactReadi
     return readings
 
 
-def error_model(sensor: ThermalSensor, recipe: Recipe) -> ErrorModel:
+def error_model(sensor: ThermalCamera, recipe: Recipe) -> ErrorModel:
     """One-sigma errors of an observation's parts, from the sensor and the recipe."""
     r = recipe.radiometry
     return ErrorModel(
@@ -343,8 +338,8 @@ def _calibrate(
         return None, ()
     if len(seen.views) < 2:
         return None, ("one thermal view cannot be cross-calibrated: the camera's offset stays in the result",)
-    camera = scan.rig.thermal
-    assert camera is not None
+    assert scan.thermal is not None
+    camera = scan.thermal.camera.lens
     calibration = cross_calibrate(
         observations,
         len(surface),

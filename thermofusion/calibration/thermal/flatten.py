@@ -32,7 +32,6 @@ def flatten_scan(
     scan = source.scan
     assert scan is not None
     assert scan.thermal is not None
-    assert scan.sensor is not None
     kept = np.flatnonzero(scan.thermal.usable)
     thermal = replace(
         scan.thermal,
@@ -41,10 +40,10 @@ def flatten_scan(
         places=source.places,
         index=scan.thermal.index[kept],
         usable=np.ones(len(kept), bool),
+        camera=replace(scan.thermal.camera, signal=SignalCurve("apparent_degC")),
     )
     notes = (*scan.notes, "thermal frames as apparent degC" + ("" if field is None else ", pixel field taken off"))
-    sensor = replace(scan.sensor, signal=SignalCurve("apparent_degC"))
-    return write_scan(replace(scan, thermal=thermal, sensor=sensor, notes=notes), out, overwrite)
+    return write_scan(replace(scan, thermal=thermal, notes=notes), out, overwrite)
 
 
 def write_flat(

@@ -143,8 +143,7 @@ def _open(path: Path, raw: RawLayout | None) -> ThermalSource:
         if not kept:
             raise ScanError("every thermal frame of the recording is marked as a shutter frame", place=path)
         places = tuple(stream.places[k] for k in kept)
-        signal = None if scan.sensor is None else scan.sensor.signal
-        return ThermalSource(places, stream.times_s[kept], lambda i: stream.load(kept[i]), signal, scan)
+        return ThermalSource(places, stream.times_s[kept], lambda i: stream.load(kept[i]), stream.camera.signal, scan)
     files = sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES) if path.is_dir() else [path]
     if not files:
         raise ScanError("there are no thermal pictures here", place=path, hint="expected PNG, TIFF, PGM or .raw")

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from ...errors import ScanError
 from ...geometry.rigid import pose
-from ...types import Scan, SignalCurve, ThermalSensor, Trajectory
-from ..common import frame_times, image_stream, make_camera, make_rig, numbered
+from ...types import Camera, Float, Scan, SignalCurve, Stream, ThermalCamera, ThermalStream, Trajectory
+from ..common import as_thermal, frame_times, image_stream, make_camera, make_rig, numbered
 
 THERMAL_SHAPE = (476, 632)
 FAR_CLIP_MM = 3975  # the recorder's far clip: no measurement
@@ -71,48 +71,21 @@ def read(path: Path, *, depth_to_color_x_m: float = -0.025) -> Scan:
     frames = numbered(files)
     numbers, depth_files = [n for n, _ in frames], [f for _, f in frames]
     times = frame_times(numbers)
-    thermal_files = [f.with_name(f"{f.stem}_0000.raw") for f in depth_files]
-    color_rows = [i for i, f in enumerate(depth_files) if f.with_suffix(".jpg").is_file()]
-
-    face = not color_rows
+    face = not any(f.with_suffix(".jpg").is_file() for f in depth_files)
     f = FACE_FOCAL_PX if face else DEPTH_FOCAL_PX
-    turn = Rotation.from_rotvec(FACE_TURN_RAD).as_matrix() if face else np.eye(3)
     depth_camera = make_camera(640, 480, np.array([[f, 0, 319.5], [0, f, 239.5], [0, 0, 1]]), place=path)
-    color_camera = make_camera(1280, 960, COLOR_K, COLOR_DISTORTION, place=path) if color_rows else None
-    thermal_camera = make_camera(*THERMAL_SHAPE[::-1], THERMAL_K, THERMAL_DISTORTION, place=path)
+    color_camera = None if face else make_camera(1280, 960, COLOR_K, COLOR_DISTORTION, place=path)
     T_color_depth = pose(np.eye(3), np.array([depth_to_color_x_m, 0, 0]))
-    color = None
-    if color_camera is not None:
-        color = image_stream(
-            "color",
-            [depth_files[i].with_suffix(".jpg") for i in color_rows],
-            times[color_rows],
-            color_camera,
-            place=path,
-            index=[numbers[i] for i in color_rows],
-        )
     return Scan(
         name=path.resolve().stem,
         root=root,
         format="jhu",
-        rig=make_rig(
-            depth_camera,
-            color_camera,
-            T_color_depth if color_camera is not None else None,
-            thermal_camera,
-            pose(turn, np.zeros(3)) @ T_THERMAL_COLOR @ T_color_depth,
-            place=path,
-        ),
+        rig=make_rig(depth_camera, color_camera, None if face else T_color_depth, place=path),
         depth=image_stream(
             "depth", depth_files, times, depth_camera, place=path, index=numbers, invalid=(0, FAR_CLIP_MM)
         ),
-        color=color,
-        thermal=image_stream(
-            "thermal", thermal_files, times, thermal_camera, place=path, index=numbers, decode=decode_counts
-        ),
-        sensor=ThermalSensor(
-            SignalCurve("counts", "polynomial", {"coefficients_degC": COEFFICIENTS_DEGC}), (7.5, 13.5), 0.0315
-        ),
+        color=None if color_camera is None else _color(depth_files, times, numbers, color_camera, path),
+        thermal=_thermal(depth_files, times, numbers, T_color_depth, path),
         trajectory=Trajectory(times, np.eye(4)[None]) if len(files) == 1 else None,
         notes=(
             "cameras refitted from the authors' picks (colour to thermal 3.4 px rms: the rig was moved between groups)",
@@ -122,6 +95,31 @@ def read(path: Path, *, depth_to_color_x_m: float = -0.025) -> Scan:
             "no times: 30 frames a second by number are assumed",
         ),
     )
+
+
+def _color(depth_files: list[Path], times_s: Float, numbers: list[int], camera: Camera, path: Path) -> Stream:
+    """The pictures beside the depth frames, where there are some."""
+    rows = [i for i, f in enumerate(depth_files) if f.with_suffix(".jpg").is_file()]
+    files, index = [depth_files[i].with_suffix(".jpg") for i in rows], [numbers[i] for i in rows]
+    return image_stream("color", files, times_s[rows], camera, place=path, index=index)
+
+
+def _thermal(
+    depth_files: list[Path], times_s: Float, numbers: list[int], T_color_depth: Float, path: Path
+) -> ThermalStream:
+    """The thermal frames beside the depth frames; without colour pictures they are of the face's session."""
+    face = not any(f.with_suffix(".jpg").is_file() for f in depth_files)
+    turn = Rotation.from_rotvec(FACE_TURN_RAD).as_matrix() if face else np.eye(3)
+    camera = ThermalCamera(
+        make_camera(*THERMAL_SHAPE[::-1], THERMAL_K, THERMAL_DISTORTION, place=path),
+        pose(turn, np.zeros(3)) @ T_THERMAL_COLOR @ T_color_depth,
+        SignalCurve("counts", "polynomial", {"coefficients_degC": COEFFICIENTS_DEGC}),
+        (7.5, 13.5),
+        0.0315,
+    )
+    files = [f.with_name(f"{f.stem}_0000.raw") for f in depth_files]
+    stream = image_stream("thermal", files, times_s, camera.lens, place=path, index=numbers, decode=decode_counts)
+    return as_thermal(stream, camera)
 
 
 def decode_counts(data: bytes, place: object) -> NDArray[np.uint16]:

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from ...errors import ScanError
 from ...files.reading import read_json
 from ...files.strict import validated
-from ...types import Camera, Rig, Scan, SignalCurve, ThermalSensor
-from ..common import make_rig, make_stream
-from .schema import DepthCorrectionDoc, RigDoc, RigThermalDoc, camera_of, matrix_of, sensor_of
+from ...types import Camera, Scan, SignalCurve, ThermalStream
+from ..common import as_thermal, make_rig, make_stream
+from .schema import CameraDoc, DepthCorrectionDoc, RigDoc, camera_of, matrix_of, thermal_camera_of
 
 CORRECTED_UNIT_M = 0.00025  # rounding to a millimetre would undo a correction of that size; 16 bits reach 16 m
 
@@ -44,30 +44,49 @@ def with_rig(scan: Scan, path: str | Path) -> Scan:
     """
     path = Path(path)
     doc = validated(RigDoc, read_json(path), path)
-    parts: dict[str, Camera | NDArray | None] = {
-        k: getattr(scan.rig, k) for k in ("depth", "color", "thermal", "T_color_depth", "T_thermal_depth")
-    }
-    for name in ("depth", "color", "thermal"):
-        group = getattr(doc.cameras, name)
-        if group is None:
-            continue
-        camera, old = camera_of(group, f"cameras.{name}", path), getattr(scan.rig, name)
-        if old is not None and camera.shape != old.shape:
-            raise ScanError(
-                f"key 'cameras.{name}': {camera.width_px} x {camera.height_px} px, but the scan's images have "
-                f"{old.width_px} x {old.height_px}",
-                place=path,
-            )
-        if old is not None or name == "depth":
-            parts[name] = camera
-    for key in ("T_color_depth", "T_thermal_depth"):
-        rows = getattr(doc.extrinsics, key)
-        if rows is not None and parts[key.split("_")[1]] is not None:
-            parts[key] = matrix_of(rows, f"extrinsics.{key}", path)
-    sensor = _sensor(scan, doc.cameras.thermal, path)
-    rig = make_rig(**parts, place=path)  # type: ignore[arg-type]
-    scan = replace(scan, rig=rig, sensor=sensor, notes=(*scan.notes, f"cameras and extrinsics from {path.name}"))
+    depth, color, T_color_depth = scan.rig.depth, scan.rig.color, scan.rig.T_color_depth
+    if doc.cameras.depth is not None:
+        depth = _stated(doc.cameras.depth, "depth", depth, path)
+    if doc.cameras.color is not None and color is not None:
+        color = _stated(doc.cameras.color, "color", color, path)
+    if doc.extrinsics.T_color_depth is not None and color is not None:
+        T_color_depth = matrix_of(doc.extrinsics.T_color_depth, "extrinsics.T_color_depth", path)
+    scan = replace(
+        scan,
+        rig=make_rig(depth, color, T_color_depth, place=path),
+        thermal=None if scan.thermal is None else _thermal_with(scan.thermal, doc, path),
+        notes=(*scan.notes, f"cameras and extrinsics from {path.name}"),
+    )
     return scan if doc.depth_correction is None else _depth_corrected(scan, doc.depth_correction, path)
+
+
+def _stated(doc: CameraDoc, name: str, old: Camera, path: Path) -> Camera:
+    """A camera of the rig file; its size must be that of the scan's images."""
+    camera = camera_of(doc, f"cameras.{name}", path)
+    if camera.shape != old.shape:
+        raise ScanError(
+            f"key 'cameras.{name}': {camera.width_px} x {camera.height_px} px, but the scan's images have "
+            f"{old.width_px} x {old.height_px}",
+            place=path,
+        )
+    return camera
+
+
+def _thermal_with(stream: ThermalStream, doc: RigDoc, path: Path) -> ThermalStream:
+    """The thermal stream with what the rig file names of its camera in place of its own."""
+    group, rows, own = doc.cameras.thermal, doc.extrinsics.T_thermal_depth, stream.camera
+    if rows is None:
+        rows = own.T_thermal_depth.tolist()
+    if group is None:
+        T = matrix_of(rows, "extrinsics.T_thermal_depth", path)
+        try:
+            return replace(stream, camera=replace(own, T_thermal_depth=T))
+        except ValueError as e:
+            raise ScanError(str(e), place=path) from None
+    _stated(group, "thermal", own.lens, path)
+    stated = thermal_camera_of(group, doc.extrinsics.model_copy(update={"T_thermal_depth": rows}), path)
+    named = (group.model_fields_set | {"lens", "T_thermal_depth"}) - ({"signal"} if group.signal is None else set())
+    return replace(stream, camera=replace(stated, **{k: v for k, v in vars(own).items() if k not in named}))
 
 
 def _depth_corrected(scan: Scan, doc: DepthCorrectionDoc, path: Path) -> Scan:
@@ -88,17 +107,6 @@ def _depth_corrected(scan: Scan, doc: DepthCorrectionDoc, path: Path) -> Scan:
     return replace(scan, depth=depth, depth_unit_m=unit_m, notes=(*scan.notes, f"depth corrected by {path.name}"))
 
 
-def _sensor(scan: Scan, group: RigThermalDoc | None, path: Path) -> ThermalSensor | None:
-    """The scan's radiometry with what the rig names in its place."""
-    if group is None or scan.thermal is None:
-        return scan.sensor
-    stated = sensor_of(group, path)
-    if scan.sensor is None:
-        return None if group.signal is None else stated
-    named = group.model_fields_set - ({"signal"} if group.signal is None else set())
-    return replace(stated, **{k: v for k, v in vars(scan.sensor).items() if k not in named})
-
-
 def with_thermal(
     scan: Scan, frames: ThermalFrames, rig: str | Path, *, times_s: NDArray[np.float64] | None = None
 ) -> Scan:
@@ -112,24 +120,18 @@ def with_thermal(
     """
     path = Path(rig)
     doc = validated(RigDoc, read_json(path), path)
-    group, rows = doc.cameras.thermal, doc.extrinsics.T_thermal_depth
-    if group is None or rows is None:
+    if doc.cameras.thermal is None or doc.extrinsics.T_thermal_depth is None:
         raise ScanError("'cameras.thermal' and 'extrinsics.T_thermal_depth' are needed to join thermal", place=path)
-    camera = camera_of(group, "cameras.thermal", path)
-    if frames.images.shape[1:] != camera.shape:
-        h, w = frames.images.shape[1:]
+    camera = replace(thermal_camera_of(doc.cameras.thermal, doc.extrinsics, path), signal=frames.signal)
+    if frames.images.shape[1:] != camera.lens.shape:
+        (h, w), lens = frames.images.shape[1:], camera.lens
         raise ScanError(
-            f"the thermal frames are {w} x {h} px, the rig says {camera.width_px} x {camera.height_px}", place=path
+            f"the thermal frames are {w} x {h} px, the rig says {lens.width_px} x {lens.height_px}", place=path
         )
     times = frames.times_s if times_s is None else np.asarray(times_s, np.float64)
     if not np.isfinite(times).all():
         raise ScanError("the thermal frames state no times", place=frames.places[0], hint="give times_s")
-    own = sensor_of(group, path)
-    sensor = ThermalSensor(frames.signal, own.band_um, own.netd_K, own.time_offset_s, own.psf_sigma_px)
     images = frames.images
-    thermal = make_stream(times, lambda i: images[i], frames.places, place=frames.places[0], kind="thermal")
-    T_thermal_depth = matrix_of(rows, "extrinsics.T_thermal_depth", path)
-    r: Rig = scan.rig
-    joined = make_rig(r.depth, r.color, r.T_color_depth, camera, T_thermal_depth, place=path)
+    stream = make_stream(times, lambda i: images[i], frames.places, place=frames.places[0], kind="thermal")
     notes = (*scan.notes, *frames.notes, f"thermal frames joined by {path.name}")
-    return replace(scan, rig=joined, thermal=thermal, sensor=sensor, notes=notes)
+    return replace(scan, thermal=as_thermal(stream, camera), notes=notes)

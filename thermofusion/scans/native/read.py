@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,9 +13,9 @@ from ...errors import ScanError
 from ...files.reading import COPY_AGAIN, inside, read_json, read_text
 from ...files.strict import validated
 from ...files.tum import read_trajectory
-from ...types import Camera, Environment, Rig, Scan, Stream
-from ..common import image_stream
-from .schema import SCHEMA, STREAMS, ScanDoc, reference_of, rig_of, sensor_of, unknown_keys
+from ...types import Camera, Environment, Scan, Stream
+from ..common import as_thermal, image_stream
+from .schema import SCHEMA, STREAMS, ScanDoc, reference_of, rig_of, thermal_camera_of, unknown_keys
 
 __all__ = ["SCHEMA", "STREAMS", "is_native", "read_native"]
 
@@ -35,9 +36,11 @@ def read_native(root: Path) -> Scan:
     if not path.exists():
         raise ScanError("there is no scan.json here", place=root, hint="give a scan folder")
     doc = validated(ScanDoc, read_json(path), path)
-    rig = rig_of(doc.cameras, doc.extrinsics, path)
+    rig, group = rig_of(doc.cameras, doc.extrinsics, path), doc.cameras.thermal
+    camera = None if group is None else thermal_camera_of(group, doc.extrinsics, path)
     unit_m = doc.cameras.depth.depth_unit_m
-    streams = _read_frames(root, rig, unit_m)
+    cameras = {"depth": rig.depth, "color": rig.color, "thermal": None if camera is None else camera.lens}
+    streams = _read_frames(root, cameras, unit_m)
     if "depth" not in streams:
         raise ScanError("no depth frames are listed", place=root / "frames.csv")
     unknown = unknown_keys(doc)
@@ -50,8 +53,7 @@ def read_native(root: Path) -> Scan:
         rig=rig,
         depth=streams["depth"],
         color=streams.get("color"),
-        thermal=streams.get("thermal"),
-        sensor=None if doc.cameras.thermal is None else sensor_of(doc.cameras.thermal, path),
+        thermal=as_thermal(streams["thermal"], camera) if camera is not None and "thermal" in streams else None,
         environment=Environment(**{k: getattr(doc.environment, k) for k in Environment.__dataclass_fields__}),
         references=tuple(reference_of(r) for r in doc.references),
         trajectory=read_trajectory(trajectory_file) if trajectory_file.exists() else None,
@@ -72,7 +74,7 @@ class _Row:
     usable: bool
 
 
-def _read_frames(root: Path, rig: Rig, unit_m: float) -> dict[str, Stream]:
+def _read_frames(root: Path, cameras: Mapping[str, Camera | None], unit_m: float) -> dict[str, Stream]:
     path = root / "frames.csv"
     if not path.exists():
         raise ScanError("there is no frames.csv here", place=root)
@@ -88,7 +90,7 @@ def _read_frames(root: Path, rig: Rig, unit_m: float) -> dict[str, Stream]:
     rows = [_row(root, row, f"{path}, line {number}") for number, row in enumerate(table, 2)]
     streams: dict[str, Stream] = {}
     for kind in STREAMS:
-        camera: Camera | None = getattr(rig, kind)
+        camera = cameras[kind]
         own = [r for r in rows if r.stream == kind]
         if not own:
             continue

@@ -10,7 +10,7 @@ from pydantic import BaseModel, Field
 
 from ...errors import ScanError
 from ...files.strict import Border
-from ...types import BlackbodyReference, Camera, ContactReference, Reference, Rig, SignalCurve, ThermalSensor
+from ...types import BlackbodyReference, Camera, ContactReference, Reference, Rig, SignalCurve, ThermalCamera
 from ..common import Kind, make_camera, make_rig
 
 SCHEMA = "thermofusion-scan/1"
@@ -164,17 +164,20 @@ def camera_of(doc: CameraDoc, key: str, path: Path) -> Camera:
 
 
 def rig_of(cameras: CamerasDoc, extrinsics: ExtrinsicsDoc, path: Path) -> Rig:
-    """The `cameras` and `extrinsics` groups as `Rig`."""
-    parts: dict[str, Any] = {"depth": camera_of(cameras.depth, "cameras.depth", path)}
-    for name in ("color", "thermal"):
-        doc, T = getattr(cameras, name), getattr(extrinsics, f"T_{name}_depth")
-        if doc is None:
-            continue
-        if T is None:
-            raise ScanError(f"key 'extrinsics.T_{name}_depth' is needed for the {name} camera", place=path)
-        parts[name] = camera_of(doc, f"cameras.{name}", path)
-        parts[f"T_{name}_depth"] = matrix_of(T, f"extrinsics.T_{name}_depth", path)
-    return make_rig(**parts, place=f"{path}: key 'extrinsics'")
+    """Depth and colour of the `cameras` and `extrinsics` groups as `Rig`."""
+    depth = camera_of(cameras.depth, "cameras.depth", path)
+    if cameras.color is None:
+        return make_rig(depth, place=path)
+    color, T_color_depth = camera_of(cameras.color, "cameras.color", path), _extrinsic(extrinsics, "color", path)
+    return make_rig(depth, color, T_color_depth, place=f"{path}: key 'extrinsics'")
+
+
+def _extrinsic(extrinsics: ExtrinsicsDoc, name: str, path: Path) -> np.ndarray:
+    key = f"T_{name}_depth"
+    rows = getattr(extrinsics, key)
+    if rows is None:
+        raise ScanError(f"key 'extrinsics.{key}' is needed for the {name} camera", place=path)
+    return matrix_of(rows, f"extrinsics.{key}", path)
 
 
 def matrix_of(rows: list[list[float]], key: str, path: Path) -> np.ndarray:
@@ -192,21 +195,27 @@ _NEEDED = {
 }
 
 
-def sensor_of(doc: ThermalCameraDoc, path: Path) -> ThermalSensor:
-    """The radiometric part of the thermal camera's group."""
+def thermal_camera_of(doc: ThermalCameraDoc, extrinsics: ExtrinsicsDoc, path: Path) -> ThermalCamera:
+    """The thermal camera's group with its extrinsic as `ThermalCamera`; without a signal (a rig.json) the default."""
     lo, hi = doc.band_um
     if not 1 <= lo < hi <= 30:
         raise ScanError(
             f"key 'cameras.thermal.band_um': expected two rising wavelengths in 1-30 um, got {lo}, {hi}", place=path
         )
-    if doc.signal is None:  # of a rig.json
-        return ThermalSensor(SignalCurve(), doc.band_um, doc.netd_K, doc.time_offset_s, doc.psf_sigma_px)
-    signal = SignalCurve(doc.signal.kind)
-    if doc.signal.kind == "counts":
-        if doc.signal.curve is None:
-            raise ScanError("key 'cameras.thermal.signal.curve' is needed for counts", place=path)
-        signal = SignalCurve("counts", doc.signal.curve.type, _curve_parameters(doc.signal.curve, path))
-    return ThermalSensor(signal, doc.band_um, doc.netd_K, doc.time_offset_s, doc.psf_sigma_px)
+    lens, T = camera_of(doc, "cameras.thermal", path), _extrinsic(extrinsics, "thermal", path)
+    signal = SignalCurve() if doc.signal is None else _signal(doc.signal, path)
+    try:
+        return ThermalCamera(lens, T, signal, doc.band_um, doc.netd_K, doc.time_offset_s, doc.psf_sigma_px)
+    except ValueError as e:
+        raise ScanError(str(e), place=f"{path}: key 'extrinsics'") from None
+
+
+def _signal(doc: SignalDoc, path: Path) -> SignalCurve:
+    if doc.kind != "counts":
+        return SignalCurve(doc.kind)
+    if doc.curve is None:
+        raise ScanError("key 'cameras.thermal.signal.curve' is needed for counts", place=path)
+    return SignalCurve("counts", doc.curve.type, _curve_parameters(doc.curve, path))
 
 
 def _curve_parameters(doc: CurveDoc, path: Path) -> dict[str, tuple[float, ...]]:

@@ -19,8 +19,8 @@ from ...errors import ResourceError, ScanError
 from ...files.reading import PNG_MAGIC, decode_image, read_bytes
 from ...files.tum import write_trajectory
 from ...files.whole import replacing_folder
-from ...types import BlackbodyReference, Camera, Reference, Scan, Stream, Trajectory
-from ..common import Kind, as_loaded
+from ...types import BlackbodyReference, Camera, Reference, Scan, Stream, ThermalCamera, Trajectory
+from ..common import Kind, as_loaded, as_thermal
 from .schema import SCHEMA, STREAMS
 
 Selection = slice | Sequence[int] | NDArray
@@ -63,9 +63,9 @@ def scan_json(scan: Scan) -> dict[str, Any]:
     if rig.color is not None and rig.T_color_depth is not None:
         cameras["color"] = _camera(rig.color)
         extrinsics["T_color_depth"] = rig.T_color_depth.tolist()
-    if rig.thermal is not None and rig.T_thermal_depth is not None:
-        cameras["thermal"] = {**_camera(rig.thermal), **_sensor(scan)}
-        extrinsics["T_thermal_depth"] = rig.T_thermal_depth.tolist()
+    if scan.thermal is not None:
+        cameras["thermal"] = {**_camera(scan.thermal.camera.lens), **_radiometry(scan.thermal.camera)}
+        extrinsics["T_thermal_depth"] = scan.thermal.camera.T_thermal_depth.tolist()
     environment = {k: v for k, v in vars(scan.environment).items() if v is not None}
     return {
         "schema": SCHEMA,
@@ -89,10 +89,8 @@ def _camera(camera: Camera) -> dict[str, Any]:
     }
 
 
-def _sensor(scan: Scan) -> dict[str, Any]:
-    if scan.sensor is None:
-        raise ScanError("the thermal camera has no radiometry (signal, band), so it cannot be written", place=scan.root)
-    sensor, curve = scan.sensor, scan.sensor.signal
+def _radiometry(camera: ThermalCamera) -> dict[str, Any]:
+    curve = camera.signal
     signal: dict[str, Any] = {"kind": curve.kind}
     if curve.kind == "counts":
         lists = ("coefficients_degC", "counts", "degC")
@@ -100,10 +98,10 @@ def _sensor(scan: Scan) -> dict[str, Any]:
         signal["curve"] = {"type": curve.curve, **values}
     return {
         "signal": signal,
-        "band_um": list(sensor.band_um),
-        "netd_K": sensor.netd_K,
-        "time_offset_s": sensor.time_offset_s,
-        **({} if sensor.psf_sigma_px is None else {"psf_sigma_px": sensor.psf_sigma_px}),
+        "band_um": list(camera.band_um),
+        "netd_K": camera.netd_K,
+        "time_offset_s": camera.time_offset_s,
+        **({} if camera.psf_sigma_px is None else {"psf_sigma_px": camera.psf_sigma_px}),
     }
 
 
@@ -187,8 +185,9 @@ def _check_target(scan: Scan, out: Path, overwrite: bool) -> None:
 
 def _check_room(scan: Scan, folder: Path) -> None:
     needed = 1 << 20
-    for kind in STREAMS:
-        stream, camera = getattr(scan, kind), getattr(scan.rig, kind)
+    lens = None if scan.thermal is None else scan.thermal.camera.lens
+    for kind, camera in (("depth", scan.rig.depth), ("color", scan.rig.color), ("thermal", lens)):
+        stream: Stream | None = getattr(scan, kind)
         if stream is not None and camera is not None:
             needed += int(len(stream) * camera.width_px * camera.height_px * _BYTES_PER_PIXEL[kind])
     free = shutil.disk_usage(folder).free
@@ -221,8 +220,10 @@ def excerpt(
     t = scan.depth.times_s
     slack = 0.5 * float(np.median(np.diff(t))) if len(t) > 1 else 0.0
     span = (t[kept[0]] - slack, t[kept[-1]] + slack)
-    offset_s = 0.0 if scan.sensor is None else scan.sensor.time_offset_s
-    thermal_stream = _cut(scan.thermal, thermal, span, offset_s)
+    thermal_stream = None
+    if scan.thermal is not None:
+        part = _cut(scan.thermal, thermal, span, scan.thermal.camera.time_offset_s)
+        thermal_stream = None if part is None else as_thermal(part, scan.thermal.camera)
     return replace(
         scan,
         depth=_take(scan.depth, kept),
