@@ -6,41 +6,48 @@ the defaults here < the file < `--set section.key=value`. The resolved recipe is
 
 from __future__ import annotations
 
-import difflib
 import json
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 import tomli_w
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from .errors import RecipeError
 from .files.shipped import recipes_dir
+from .files.strict import first_fault, nearest, shortened
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
 
 
 class InputSection(_Section):
     """How streams are paired and which depth is believed."""
 
     pair_tolerance_ms: float = Field(
-        40.0, gt=0, description="a colour frame farther in time from its depth frame is left out"
+        40.0, ge=0.1, le=10_000, description="a colour frame farther in time from its depth frame is left out"
     )
     max_pose_gap_ms: float = Field(
-        500.0, gt=0, description="a thermal frame in a longer gap of the trajectory is left out"
+        500.0, ge=0.1, le=60_000, description="a thermal frame in a longer gap of the trajectory is left out"
     )
-    min_depth_m: float = Field(0.4, ge=0, description="nearer depth is dropped")
-    max_depth_m: float = Field(3.0, gt=0, description="farther depth is dropped")
-    max_grazing_deg: float = Field(80.0, gt=0, le=90, description="depth seen more obliquely is dropped")
+    min_depth_m: float = Field(0.4, ge=0, le=10, description="nearer depth is dropped")
+    max_depth_m: float = Field(3.0, ge=0.1, le=20, description="farther depth is dropped")
+    max_grazing_deg: float = Field(80.0, ge=10, le=90, description="depth seen more obliquely is dropped")
     flying_pixel_mm: float = Field(
         25.0,
-        gt=0,
+        ge=1,
+        le=1000,
         description="a pixel that stands this far from its neighbours at 1 m is dropped (scales with range²)",
     )
+
+    @model_validator(mode="after")
+    def _range_is_open(self) -> InputSection:
+        if not self.min_depth_m < self.max_depth_m:
+            raise ValueError(f"min_depth_m ({self.min_depth_m:g} m) must be below max_depth_m ({self.max_depth_m:g} m)")
+        return self
 
 
 class SubjectSection(_Section):
@@ -51,15 +58,15 @@ class SubjectSection(_Section):
     )
     floor: Literal["auto", "keep", "remove"] = Field("auto", description="auto: removed where a floor plane is found")
     floor_clearance_mm: float = Field(
-        12.0, ge=0, description="surface nearer than this to the floor plane goes with it"
+        12.0, ge=0, le=500, description="surface nearer than this to the floor plane goes with it"
     )
     motion: Literal["camera", "subject"] = Field(
         "camera", description="subject: the camera stands still and the subject turns"
     )
     keep_components: int = Field(
-        1, ge=0, description="largest connected pieces of surface kept; 0 = all above min_component_cm2"
+        1, ge=0, le=1000, description="largest connected pieces of surface kept; 0 = all above min_component_cm2"
     )
-    min_component_cm2: float = Field(50.0, ge=0, description="smaller pieces of surface are dropped")
+    min_component_cm2: float = Field(50.0, ge=0, le=100_000, description="smaller pieces of surface are dropped")
 
 
 class TrackingSection(_Section):
@@ -68,48 +75,64 @@ class TrackingSection(_Section):
     source: Literal["auto", "recorded", "estimate"] = Field("auto", description="auto: recorded where there is one")
     refine: bool = Field(False, description="a recorded trajectory is only a start, refined like an estimated one")
     color: bool = Field(True, description="colour helps where a colour camera was recorded")
-    fragment_frames: int = Field(8, ge=2, description="consecutive frames fused before loop closure")
+    fragment_frames: int = Field(8, ge=2, le=1000, description="consecutive frames fused before loop closure")
     loop_closure: bool = True
     refine_to_model: bool = Field(True, description="a last alignment of every frame with the fused model")
     min_fitness: float = Field(0.5, gt=0, le=1, description="share of a frame's points that must find a partner")
     max_residual_mm: float = Field(
-        8.0, gt=0, description="median point-to-plane distance at 1 m above which a frame is lost"
+        8.0, ge=0.1, le=1000, description="median point-to-plane distance at 1 m above which a frame is lost"
     )
 
 
-class FusionSection(_Section):
+class SurfaceSection(_Section):
     """Depth frames into one surface (TSDF)."""
 
-    voxel_mm: Literal["auto"] | float = Field(
+    voxel_mm: Literal["auto"] | Annotated[float, Field(ge=0.5, le=100)] = Field(
         "auto", description="edge of a voxel; auto: from depth noise and thermal footprint"
     )
-    truncation_voxels: Literal["auto"] | float = Field(
+    truncation_voxels: Literal["auto"] | Annotated[float, Field(ge=1, le=50)] = Field(
         "auto", description="TSDF truncation in voxels; auto: 3.5 times the depth noise, at least 2.5 voxels and 8 mm"
     )
-    min_weight: float = Field(3.0, ge=0, description="surface seen by fewer depth frames is dropped")
+    min_weight: float = Field(3.0, ge=0, le=10_000, description="surface seen by fewer depth frames is dropped")
     normal_window_mm: float = Field(
-        25.0, gt=0, description="normals are averaged over this diameter (20-30 mm for Kinect)"
+        25.0, ge=1, le=200, description="normals are averaged over this diameter (20-30 mm for Kinect)"
     )
-    smooth_iterations: int = Field(0, ge=0, description="Taubin smoothing steps of the mesh")
-    max_memory_gib: float = Field(2.0, gt=0, description="bound on the voxel grid's memory; the voxel grows to meet it")
+    smooth_iterations: int = Field(0, ge=0, le=1000, description="Taubin smoothing steps of the mesh")
+    max_memory_gib: float = Field(
+        2.0, ge=0.001, le=1024, description="bound on the voxel grid's memory; the voxel grows to meet it"
+    )
     color: bool = Field(True, description="colour the surface from the colour camera")
+
+
+class RigSection(_Section):
+    """The thermal camera's place and clock."""
+
+    align: bool = Field(True, description="refine the rig extrinsic and the thermal clock where the data support it")
 
 
 class MappingSection(_Section):
     """Thermal views onto the surface."""
 
     silhouette_px: float = Field(
-        3.0, ge=0, description="pixels nearer to a silhouette count only where nothing clearer saw the spot"
+        3.0, ge=0, le=100, description="pixels nearer to a silhouette count only where nothing clearer saw the spot"
     )
-    last_resort_silhouette_px: float = Field(2.0, ge=0, description="pixels nearer than this are never used")
-    border_px: float = Field(8.0, ge=0, description="pixels nearer to the image border are rejected")
+    last_resort_silhouette_px: float = Field(2.0, ge=0, le=100, description="pixels nearer than this are never used")
+    border_px: float = Field(8.0, ge=0, le=500, description="pixels nearer to the image border are rejected")
     max_angle_deg: float = Field(
-        65.0, gt=0, lt=90, description="more oblique views count only where nothing better saw the spot"
+        65.0, ge=5, le=89, description="more oblique views count only where nothing better saw the spot"
     )
-    last_resort_angle_deg: float = Field(75.0, gt=0, lt=90, description="beyond this a view is never used")
+    last_resort_angle_deg: float = Field(75.0, ge=5, le=89, description="beyond this a view is never used")
     visibility_tolerance_mm: float = Field(
-        8.0, gt=0, description="how far behind the visible surface a vertex may lie and still count as seen"
+        8.0, ge=0.1, le=200, description="how far behind the visible surface a vertex may lie and still count as seen"
     )
+    view_motion: bool = Field(False, description="small rigid correction of each view (breathing, sway)")
+
+    @model_validator(mode="after")
+    def _last_resort_is_steeper(self) -> MappingSection:
+        if self.last_resort_angle_deg < self.max_angle_deg:
+            least = f"{self.max_angle_deg:g}°, the value of max_angle_deg"
+            raise ValueError(f"last_resort_angle_deg must be at least {least}")
+        return self
 
 
 class EmissivitySection(_Section):
@@ -117,42 +140,23 @@ class EmissivitySection(_Section):
 
     model: Literal["dielectric", "non-dielectric", "cosine", "water", "tabulated", "fitted", "blackbody"] = "dielectric"
     n: float | None = Field(
-        None, gt=1, description="refractive index; None = 1.33 (dielectric, non-dielectric) or 1.2233 (fitted: water)"
+        None,
+        gt=1,
+        le=20,
+        description="refractive index; None = 1.33 (dielectric, non-dielectric) or 1.2233 (fitted: water)",
     )
     k: float | None = Field(
-        None, ge=0, description="extinction coefficient; None = 0.25 (non-dielectric) or 0.1304 (fitted: water)"
+        None, ge=0, le=50, description="extinction coefficient; None = 0.25 (non-dielectric) or 0.1304 (fitted: water)"
     )
     epsilon0: float | None = Field(
-        None, gt=0, le=1, description="emissivity straight on; scales the model's curve to it"
+        None, ge=0.01, le=1, description="emissivity straight on; scales the model's curve to it"
     )
-    angles_deg: list[float] = Field(default_factory=list, description="tabulated: angles, rising from 0")
-    values: list[float] = Field(default_factory=list, description="tabulated: ε at those angles")
-
-
-class RadiometrySection(_Section):
-    """From signal to temperature."""
-
-    method: Literal["joint", "corrected-cos", "cos-resolution", "mean", "nearest-view", "paper"] = Field(
-        "joint", description="joint = cross-calibrated views; the others are for comparison"
+    angles_deg: list[Annotated[float, Field(ge=0, le=90)]] = Field(
+        default_factory=list, description="tabulated: angles, rising from 0"
     )
-    output: Literal["absolute", "normal-equivalent", "apparent"] = Field(
-        "absolute", description="what scalar_temperature holds"
+    values: list[Annotated[float, Field(ge=0, le=1)]] = Field(
+        default_factory=list, description="tabulated: ε at those angles"
     )
-    weight: Literal["inverse-variance", "cos-resolution"] = "inverse-variance"
-    reflected_degC: float | None = Field(None, description="overrides the scan's environment")
-    air_degC: float | None = Field(None, description="overrides the scan's environment")
-    transmission_per_m: float = Field(
-        1.0, gt=0, le=1, description="of the air path; 1 = neglected, its size stands in the budget"
-    )
-    sigma_reflected_K: float = Field(0.5, ge=0, description="of the reflected temperature, measured with crumpled foil")
-    sigma_normal_deg: float | None = Field(
-        None, ge=0, description="of surface normals; None = estimated from depth noise and window"
-    )
-    sigma_registration_px: float = Field(
-        0.3, ge=0, description="of the thermal image on the mesh; an aligned rig leaves 0.15-0.3"
-    )
-    sigma_emissivity0: float = Field(0.01, ge=0, description="of ε(0): enters the absolute level")
-    sigma_shape: float = Field(0.15, ge=0, description="relative uncertainty of 1-ε(θ)'s shape")
 
 
 class CrosscalSection(_Section):
@@ -163,9 +167,37 @@ class CrosscalSection(_Section):
     shape: bool = Field(True, description="the shape of ε(θ), where the overlap carries it")
     gain: bool = Field(False, description="one gain of the camera, where references carry it")
     surroundings: bool = Field(True, description="the body's own radiation, reflected in folds")
-    align: bool = Field(True, description="refine the rig extrinsic and the thermal clock where the data support it")
-    motion: bool = Field(False, description="small rigid correction of each view (breathing, sway)")
-    max_vertices: int = Field(20_000, ge=1000, description="vertices the solver uses; all are mapped")
+    max_vertices: int = Field(20_000, ge=1000, le=10_000_000, description="vertices the solver uses; all are mapped")
+
+
+class TemperatureSection(_Section):
+    """From signal to temperature."""
+
+    method: Literal["joint", "corrected-cos", "cos-resolution", "mean", "nearest-view", "paper"] = Field(
+        "joint", description="joint = cross-calibrated views; the others are for comparison"
+    )
+    output: Literal["absolute", "normal-equivalent", "apparent"] = Field(
+        "absolute", description="what scalar_temperature holds"
+    )
+    weight: Literal["inverse-variance", "cos-resolution"] = "inverse-variance"
+    reflected_degC: float | None = Field(None, ge=-100, le=500, description="overrides the scan's environment")
+    air_degC: float | None = Field(None, ge=-100, le=200, description="overrides the scan's environment")
+    transmission_per_m: float = Field(
+        1.0, ge=0.01, le=1, description="of the air path; 1 = neglected, its size stands in the budget"
+    )
+    sigma_reflected_K: float = Field(
+        0.5, ge=0, le=100, description="of the reflected temperature, measured with crumpled foil"
+    )
+    sigma_normal_deg: float | None = Field(
+        None, ge=0, le=45, description="of surface normals; None = estimated from depth noise and window"
+    )
+    sigma_registration_px: float = Field(
+        0.3, ge=0, le=20, description="of the thermal image on the mesh; an aligned rig leaves 0.15-0.3"
+    )
+    sigma_emissivity0: float = Field(0.01, ge=0, le=0.5, description="of ε(0): enters the absolute level")
+    sigma_shape: float = Field(0.15, ge=0, le=2, description="relative uncertainty of 1-ε(θ)'s shape")
+    emissivity: EmissivitySection = EmissivitySection()
+    crosscal: CrosscalSection = CrosscalSection()
 
 
 class OutputSection(_Section):
@@ -175,14 +207,14 @@ class OutputSection(_Section):
     views: bool = Field(True, description="views/*.png")
     palette: Literal["inferno", "iron", "grey", "cividis", "rainbow"] = "inferno"
     range_degC: tuple[float, float] | None = Field(
-        None, description="colour range, low and high; None = 1st to 99th percentile"
+        None, strict=False, description="colour range, low and high; None = 1st to 99th percentile"
     )
 
     @field_validator("range_degC")
     @classmethod
     def _rising(cls, value: tuple[float, float] | None) -> tuple[float, float] | None:
-        if value is not None and not value[0] < value[1]:
-            raise ValueError("low must be below high")
+        if value is not None and not (value[0] >= -100 and value[0] + 0.1 <= value[1] <= 1000):
+            raise ValueError("expected low and high between -100 and 1000 °C, low at least 0.1 °C below high")
         return value
 
 
@@ -191,37 +223,62 @@ class QualitySection(_Section):
 
     min_tracked_fraction: float = Field(0.8, ge=0, le=1)
     min_coverage: float = Field(0.5, ge=0, le=1, description="share of the surface with a temperature")
-    max_median_sigma_K: float = Field(0.5, gt=0)
+    max_median_sigma_K: float = Field(0.5, gt=0, le=100)
+
+
+# Where keys of earlier recipes went, the more particular first. They are accepted, with a note.
+RENAMED = {
+    "crosscal.align": "rig.align",
+    "crosscal.motion": "mapping.view_motion",
+    "crosscal": "temperature.crosscal",
+    "emissivity": "temperature.emissivity",
+    "radiometry": "temperature",
+    "fusion": "surface",
+}
+# What earlier versions called the stages, in `--from` and `--until`.
+RENAMED_STAGES = {"track": "tracking", "fusion": "surface", "align": "rig", "observe": "mapping"}
 
 
 class Recipe(_Section):
     """The whole tree."""
 
-    name: str = "custom"
-    description: str = ""
+    name: str = Field("custom", max_length=200)
+    description: str = Field("", max_length=2000)
     input: InputSection = InputSection()
     subject: SubjectSection = SubjectSection()
     tracking: TrackingSection = TrackingSection()
-    fusion: FusionSection = FusionSection()
+    surface: SurfaceSection = SurfaceSection()
+    rig: RigSection = RigSection()
     mapping: MappingSection = MappingSection()
-    emissivity: EmissivitySection = EmissivitySection()
-    radiometry: RadiometrySection = RadiometrySection()
-    crosscal: CrosscalSection = CrosscalSection()
+    temperature: TemperatureSection = TemperatureSection()
     output: OutputSection = OutputSection()
     quality: QualitySection = QualitySection()
+
+    @field_validator("name", "description")
+    @classmethod
+    def _can_be_printed(cls, value: str) -> str:
+        if not value.replace("\n", " ").isprintable():
+            raise ValueError("it holds a character that cannot be printed")
+        return value
 
     def to_toml(self) -> str:
         """The resolved recipe as TOML; keys whose value is None are left out (their default)."""
         return tomli_w.dumps(self.model_dump(exclude_none=True, mode="json"))
 
 
-def load_recipe(source: str | Path | Mapping[str, Any] = "torso", overrides: Sequence[str] = ()) -> Recipe:
+def load_recipe(
+    source: str | Path | Mapping[str, Any] = "torso",
+    overrides: Sequence[str] = (),
+    *,
+    note: Callable[[str], None] = lambda _: None,
+) -> Recipe:
     """A recipe from a shipped name ("torso"), a TOML file, or a mapping, with `section.key=value` overrides.
 
-    Raises RecipeError naming the key, its nearest match, or what the value must be.
+    note : told in a sentence where a key has a new name. Raises RecipeError naming the file or the override, the key,
+    its nearest match, or what the value must be.
     """
     if isinstance(source, Mapping):
-        tree, place = {**source}, "recipe"
+        tree, place = json.loads(json.dumps(source)), "recipe"
     else:
         path = find_recipe(source)
         place = str(path)
@@ -229,12 +286,17 @@ def load_recipe(source: str | Path | Mapping[str, Any] = "torso", overrides: Seq
             tree = tomllib.loads(path.read_text(encoding="utf-8"))
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
             raise RecipeError(f"not a TOML file: {e}", place=place) from None
-    for item in overrides:
-        _override(tree, item)
+    tree = _under_new_names(tree, note)
+    given = [_override(tree, item, note) for item in overrides]
     try:
         return Recipe.model_validate(tree)
     except ValidationError as e:
-        raise RecipeError(_first_fault(e), place=place) from None
+        loc, sentence = first_fault(Recipe, e)
+        for item, key in zip(reversed(overrides), reversed(given), strict=True):
+            if key[: len(loc)] == loc or loc[: len(key)] == key:
+                place = f"--set {shortened(item)}"
+                break
+        raise RecipeError(sentence, place=place) from None
 
 
 def find_recipe(source: str | Path) -> Path:
@@ -248,7 +310,7 @@ def find_recipe(source: str | Path) -> Path:
     if shipped.is_file():
         return shipped
     raise RecipeError(
-        f"there is no recipe '{source}'{_nearest(str(source), shipped_recipes())}",
+        f"there is no recipe '{source}'{nearest(str(source), shipped_recipes())}",
         hint="`thermofusion recipe list` shows the shipped ones",
     )
 
@@ -260,20 +322,32 @@ def shipped_recipes() -> list[str]:
 
 def key_reference() -> str:
     """Every key of the tree with its default and meaning, as Markdown tables (docs/recipes.md)."""
-    lines = []
-    for name, section in Recipe.model_fields.items():
-        keys = getattr(section.annotation, "model_fields", None)
-        if not keys:
-            continue
-        lines += [f"## `[{name}]`", "", (section.annotation.__doc__ or "").strip(), ""]
+    lines: list[str] = []
+    for name, section in _sections(Recipe):
+        lines += [f"## `[{name}]`", "", (section.__doc__ or "").strip(), ""]
         lines += ["| key | default | meaning |", "|---|---|---|"]
-        for key, field in keys.items():
+        for key, field in section.model_fields.items():
+            if _is_section(field.annotation):
+                continue
             default = "not set" if field.default is None else json.dumps(field.get_default(call_default_factory=True))
             choices = " \\| ".join(f"`{c}`" for c in _choices(field.annotation))
             meaning = "; ".join(part for part in (field.description, choices) if part)
             lines.append(f"| `{key}` | `{default}` | {meaning} |")
         lines.append("")
     return "\n".join(lines)
+
+
+def _sections(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, type[BaseModel]]]:
+    """Dotted names of all sections below a model, outer before inner."""
+    for name, field in model.model_fields.items():
+        if _is_section(field.annotation):
+            section: type[BaseModel] = field.annotation  # type: ignore[assignment]
+            yield prefix + name, section
+            yield from _sections(section, f"{prefix}{name}.")
+
+
+def _is_section(annotation: Any) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
 
 
 def _choices(annotation: Any) -> tuple[str, ...]:
@@ -283,34 +357,52 @@ def _choices(annotation: Any) -> tuple[str, ...]:
     return tuple(c for part in get_args(annotation) for c in _choices(part))
 
 
-def _override(tree: dict[str, Any], item: str) -> None:
+def _under_new_names(tree: dict[str, Any], note: Callable[[str], None]) -> dict[str, Any]:
+    """The tree with keys of earlier recipes moved to where they are now."""
+    for old, new in RENAMED.items():
+        *parents, last = old.split(".")
+        node = _node(tree, parents)
+        if node is None or last not in node:
+            continue
+        note(f"the recipe's '{old}' is called '{new}' now")
+        value, (*into, name) = node.pop(last), new.split(".")
+        target = _node(tree, into, make=True)
+        if target is None:
+            raise RecipeError(f"'{old}' and '{into[0]}' cannot both be given: '{old}' is called '{new}' now")
+        if isinstance(value, dict) and isinstance(target.get(name), dict):
+            value = {**value, **target[name]}
+        target[name] = value
+        if parents and not node:
+            tree.pop(parents[0])
+    return tree
+
+
+def _node(tree: dict[str, Any], path: Sequence[str], *, make: bool = False) -> dict[str, Any] | None:
+    """The table at a path; None where there is none, or, with `make`, where something else is."""
+    for part in path:
+        tree = tree.setdefault(part, {}) if make else tree.get(part, {})
+        if not isinstance(tree, dict):
+            return None
+    return tree
+
+
+def _override(tree: dict[str, Any], item: str, note: Callable[[str], None]) -> tuple[str, ...]:
+    """Put `section.key=value` into the tree; returns the key's path, under its new name."""
     key, sep, text = item.partition("=")
-    if not sep or not key.strip():
-        raise RecipeError(f"--set needs section.key=value, got '{item}'")
+    old = key.strip()
+    if not sep or not all(part.isidentifier() for part in old.split(".")):
+        raise RecipeError(f"--set needs section.key=value, got '{shortened(item)}'")
+    new = next((new + old[len(name) :] for name, new in RENAMED.items() if f"{old}.".startswith(f"{name}.")), old)
+    if new != old:
+        note(f"the recipe's '{old}' is called '{new}' now")
+    *parents, last = new.split(".")
+    node = _node(tree, parents, make=True)
+    if node is None:
+        raise RecipeError(f"'{'.'.join(parents)}' has no keys below it", place=f"--set {shortened(item)}")
     try:
-        value = json.loads(text)
-    except json.JSONDecodeError:
-        value = text
-    node: dict[str, Any] = tree
-    *parents, last = key.strip().split(".")
-    for part in parents:
-        node[part] = dict(node.get(part, {}))
-        node = node[part]
-    node[last] = value
-
-
-def _first_fault(error: ValidationError) -> str:
-    """One sentence on the first fault, with the nearest known key for an unknown one."""
-    fault = error.errors()[0]
-    loc = [str(p) for p in fault["loc"]]
-    if fault["type"] == "extra_forbidden":
-        model: Any = Recipe
-        for part in loc[:-1]:
-            model = model.model_fields[part].annotation
-        return f"unknown key '{'.'.join(loc)}'{_nearest(loc[-1], list(model.model_fields))}"
-    return f"key '{'.'.join(loc)}': {fault['msg'][0].lower()}{fault['msg'][1:]}, got {fault['input']!r}"
-
-
-def _nearest(word: str, known: Sequence[str]) -> str:
-    match = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
-    return f" (did you mean '{match[0]}'?)" if match else ""
+        node[last] = json.loads(text)
+    except RecursionError:
+        raise RecipeError("the value is nested too deep", place=f"--set {shortened(item)}") from None
+    except ValueError:  # no JSON: a word
+        node[last] = text
+    return (*parents, last)

@@ -142,3 +142,20 @@ def _average(triangles: Int, count: int, self_weight: float) -> csr_matrix:
     A = A + diags(np.full(count, np.float32(self_weight)), format="csr", dtype=np.float32)
     total = np.asarray(A.sum(1), np.float32).ravel()
     return (diags(1 / np.maximum(total, np.float32(1e-12)), dtype=np.float32) @ A).tocsr()
+
+
+def edge_gradient(vertices: Float32, triangles: Int, values: NDArray) -> Float32:
+    """Magnitude of the gradient of values (V,) along a surface of vertices (V, 3) m, per metre; 0 where unmeasured.
+
+    Root mean square over a vertex's edges of the directional derivative, times √2 (an edge's direction is random).
+    """
+    a = np.concatenate([triangles[:, 0], triangles[:, 1], triangles[:, 2]])
+    b = np.concatenate([triangles[:, 1], triangles[:, 2], triangles[:, 0]])
+    length2 = ((vertices[a] - vertices[b]) ** 2).sum(1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slope2 = (values[a] - values[b]) ** 2 / length2
+    good = np.isfinite(slope2)
+    n = len(vertices)
+    total = np.bincount(a[good], slope2[good], n) + np.bincount(b[good], slope2[good], n)
+    count = np.bincount(a[good], minlength=n) + np.bincount(b[good], minlength=n)
+    return np.sqrt(2 * total / np.maximum(count, 1)).astype(np.float32)

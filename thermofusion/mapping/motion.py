@@ -8,14 +8,12 @@ alternate blocks are left out, and the fitted motion must bring *their* outline 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
 from ..geometry.rigid import invert, se3_exp
-from ..rig.align import AlignmentResult
+from ..progress import Progress, silent
 from ..rig.outlines import OutlineResidual, OutlineView, measure_outline, reach_px, read_outlines, weights_about_median
 from ..robust import mad_sigma
 from ..types import Bool, Float, SurfaceMesh, ThermalStream, ThermalViews
@@ -53,49 +51,45 @@ def view_corrections(
     stream: ThermalStream,
     mesh: SurfaceMesh,
     views: ThermalViews,
-    alignment: AlignmentResult | None = None,
+    width_px: float = float("nan"),
     *,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Progress = silent,
 ) -> MotionResult:
     """A small rigid correction of every thermal view against the model's outline, if it predicts left-out outline.
 
     Parameters
     ----------
-    views : the aligned views. alignment : gives the outline's common width; None: its median is used.
+    views : the aligned views. width_px : of the outline, common to all views (`rig`); NaN: its median is used.
 
     Raises ScanError for an image that cannot be read.
     """
     camera = stream.camera.lens
-    report = None if progress is None else partial(progress, "motion")
-    outlines, contrast = read_outlines(stream, mesh, views.frame.tolist(), views.T_world_thermal, report)
+    poses = views.T_world_thermal
+    outlines, contrast = read_outlines(
+        stream, mesh, views.frame.tolist(), poses, lambda _, done, total: progress("mapping", done, total)
+    )
     if contrast is None:
         return _none(views, "the outline does not stand out from the background in the thermal images")
     T_thermal_world = invert(views.T_world_thermal)
     reach = reach_px(camera, REACH_DEG)
     seen = [measure_outline(camera, v, T_thermal_world[v.row], reach, contrast) for v in outlines]
-    width = _common_width(seen, alignment)
+    if not np.isfinite(width_px):  # no motion, and not to be explained by one
+        width_px = float(np.median(np.concatenate([m.residual_px for m in seen])))
     motion_of = np.zeros((len(views), 6))
     before, after = [], []
     for view, first in zip(outlines, seen, strict=True):
         about, black = _about(view.range_m), _black_blocks(view, first)
         for left in (black, ~black):
-            x = _fit(first, about, width, ~left)
+            x = _fit(first, about, width_px, ~left)
             if x is not None:
-                before.append(first.residual_px[left] - width)
+                before.append(first.residual_px[left] - width_px)
                 after.append(before[-1] - first.motion[left] @ about @ x)
-        x = _fit(first, about, width)
+        x = _fit(first, about, width_px)
         if x is not None:
             T = se3_exp(about @ x) @ T_thermal_world[view.row]
-            again = _fit(measure_outline(camera, view, T, reach, contrast), about, width, start=x)
+            again = _fit(measure_outline(camera, view, T, reach, contrast), about, width_px, start=x)
             motion_of[view.row] = x if again is None else again
     return _decide(views, outlines, motion_of, _spread(before), _spread(after))
-
-
-def _common_width(seen: list[OutlineResidual], alignment: AlignmentResult | None) -> float:
-    """By how much the images' outline lies outside the model's: no motion, and not to be explained by one."""
-    if alignment is not None and np.isfinite(alignment.outline_width_px):
-        return alignment.outline_width_px
-    return float(np.median(np.concatenate([m.residual_px for m in seen])))
 
 
 def _black_blocks(view: OutlineView, seen: OutlineResidual) -> Bool:

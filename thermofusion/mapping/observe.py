@@ -7,8 +7,8 @@ its pixel is clear of silhouettes: there the point spread mixes skin with room (
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -18,8 +18,26 @@ from ..errors import ScanError
 from ..geometry.camera import project, viewing_cosine
 from ..geometry.rays import RayScene
 from ..geometry.rigid import invert, transform_points
-from ..recipe import MappingSection
-from ..types import Bool, Camera, Float, Float32, Int, Observations, SurfaceMesh, ThermalStream, ThermalViews
+from ..physics.signal import SignalConverter
+from ..progress import Progress, silent
+from ..recipe import InputSection, MappingSection
+from ..rig.align import RigResult
+from ..types import (
+    Bool,
+    Camera,
+    Float,
+    Float32,
+    Int,
+    Observations,
+    Scan,
+    SurfaceMesh,
+    ThermalStream,
+    ThermalViews,
+    Trajectory,
+)
+from .motion import MotionResult, view_corrections
+from .references import BlackbodyReading, read_blackbodies
+from .views import thermal_views
 
 EDGE_CAP_PX = 32.0  # distances to a silhouette are stored up to here; nothing depends on larger ones
 NORMAL_OFFSET_M = 0.003  # a ray to the eye starts this far off the surface, so that noise does not shadow itself
@@ -63,32 +81,66 @@ class SurfaceRays:
         return np.concatenate([p, (p + q) / 2, q])
 
 
+@dataclass(frozen=True, eq=False)
+class Mapped:
+    """What the thermal views saw: observations of vertices, and readings of blackbodies.
+
+    left_out : thermal frames that did not enter, by reason. motion : corrections of single views, if asked for.
+    """
+
+    views: ThermalViews
+    left_out: dict[str, int]
+    observations: Observations
+    blackbodies: tuple[BlackbodyReading, ...]
+    motion: MotionResult | None = None
+
+
 def observe(
+    scan: Scan,
+    surface: SurfaceMesh,
+    trajectory: Trajectory,
+    rig: RigResult,
+    *,
+    input: InputSection,
+    mapping: MappingSection,
+    progress: Progress = silent,
+) -> Mapped:
+    """Project all thermal views onto the surface, with the aligned rig and clock.
+
+    Raises ScanError if no thermal frame can be placed, or no view sees the surface.
+    """
+    views, left_out = thermal_views(scan, trajectory, input.max_pose_gap_ms / 1e3, rig.camera)
+    assert scan.thermal is not None
+    stream, motion = scan.thermal, None
+    if mapping.view_motion:
+        motion = view_corrections(stream, surface, views, rig.outline_width_px, progress=progress)
+        views = replace(views, T_world_thermal=motion.T_world_thermal)
+    converter = SignalConverter(stream.camera)
+    observations = observe_views(stream, SurfaceRays(surface), views, converter, mapping, progress=progress)
+    return Mapped(views, left_out, observations, read_blackbodies(stream, views, scan.references, converter), motion)
+
+
+def observe_views(
     stream: ThermalStream,
     surface: SurfaceRays,
     views: ThermalViews,
-    to_radiance: Callable[[NDArray], Float32],
+    converter: SignalConverter,
     mapping: MappingSection,
     *,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = silent,
 ) -> Observations:
-    """All observations of the surface's vertices by the thermal views.
-
-    to_radiance : a stored thermal image -> (H, W) float32 in-band radiance, NaN where the pixel is unusable.
-    Raises ScanError if no view sees the surface.
-    """
-    lens = stream.camera.lens
+    """All observations of the surface's vertices by the thermal views. Raises ScanError if no view sees the surface."""
 
     def one(view: int) -> Observations:
-        image = to_radiance(stream.load(int(views.frame[view])))
-        return observe_view(surface, lens, views.T_world_thermal[view], image, mapping, view=view)
+        frame = int(views.frame[view])
+        image = converter.radiance(stream.load(frame), stream.places[frame])
+        return observe_view(surface, stream.camera.lens, views.T_world_thermal[view], image, mapping, view=view)
 
     parts: list[Observations] = []
     with ThreadPoolExecutor(max_workers=3) as pool:
         for part in pool.map(one, range(len(views))):
             parts.append(part)
-            if progress:
-                progress(len(parts), len(views))
+            progress("mapping", len(parts), len(views))
     columns = Observations.__dataclass_fields__
     if not sum(len(p) for p in parts):
         raise ScanError(

@@ -1,61 +1,62 @@
-"""Readings of references: what sets the level of a result."""
+"""Blackbodies as the thermal views saw them. What they should have read is the temperature step's business."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..physics.band import Band
+from ..physics.band import ZERO_DEGC_K
+from ..physics.signal import SignalConverter
 from ..robust import mad_sigma
-from ..types import Float, Int
+from ..types import BlackbodyReference, Float, Reference, ThermalStream, ThermalViews
+
+POLYGON_MARGIN_PX = 3.0  # blur at the source's rim stays outside the reading
+LEAST_SPREAD = 0.2  # of NETD: the spread of a reading's pixels is taken to be no smaller
+KEPT_SIGMAS = 3.0  # a pixel farther from the median is no part of the source
 
 
 @dataclass(frozen=True)
 class BlackbodyReading:
     """A source of known temperature as one view saw it.
 
-    measured, expected : in-band radiance, W m-2 sr-1. sigma_measured : noise of the mean over the polygon.
-    sigma_expected : of the source's temperature, common to all its readings. u_px, v_px : middle of the polygon.
+    view : row of the thermal views. reference : position in the scan's references. measured : in-band radiance,
+    W m-2 sr-1; sigma_measured : noise of the mean over the polygon. u_px, v_px : middle of the polygon.
     """
 
     view: int
+    reference: int
     measured: float
-    expected: float
     sigma_measured: float
-    sigma_expected: float
     u_px: float
     v_px: float
 
 
-@dataclass(frozen=True, eq=False)
-class ContactReading:
-    """A thermometer on the skin: radiance of a black body at its reading, at one or more vertices around the spot."""
+def read_blackbodies(
+    stream: ThermalStream, views: ThermalViews, references: Sequence[Reference], converter: SignalConverter
+) -> tuple[BlackbodyReading, ...]:
+    """Every blackbody in every view that it was recorded in."""
+    readings = []
+    for number, reference in enumerate(references):
+        if not isinstance(reference, BlackbodyReference):
+            continue
+        for view in np.flatnonzero(np.isin(stream.index[views.frame], reference.frames)).tolist():
+            frame = int(views.frame[view])
+            image = converter.radiance(stream.load(frame), stream.places[frame])
+            netd_L = stream.camera.netd_K * float(converter.band.d_radiance_dT(reference.degC + ZERO_DEGC_K))
+            found = read_polygon(image, reference.polygon_px, netd_L)
+            if found is not None:
+                readings.append(BlackbodyReading(view, number, *found))
+    return tuple(readings)
 
-    vertices: Int
-    expected: float
-    sigma_expected: float
 
+def read_polygon(radiance: NDArray, polygon_px: NDArray, netd_L: float) -> tuple[float, float, float, float] | None:
+    """A source in one radiance image (H, W) W m-2 sr-1: robust mean over the polygon less a margin for blur.
 
-POLYGON_MARGIN_PX = 3.0  # blur at the source's rim stays outside the reading
-
-
-def read_blackbody(
-    radiance: NDArray,
-    polygon_px: NDArray,
-    *,
-    view: int,
-    T_K: float,
-    sigma_K: float,
-    emissivity: float,
-    L_reflected: float,
-    band: Band,
-    netd_K: float,
-) -> BlackbodyReading | None:
-    """Reading of a blackbody in one radiance image (H, W): robust mean over the polygon less a margin for blur.
-
-    Expected is ε L(T) + (1-ε) L_reflected. None if no pixel of the polygon is usable.
+    polygon_px : (N, 2) corners. netd_L : a pixel's noise, as radiance. Returns mean, its sigma, and the
+    middle u, v, px; None if no pixel of the polygon is usable.
     """
     v, u, rim = _inside_polygon(radiance.shape, np.asarray(polygon_px, np.float64))
     deep = rim >= min(POLYGON_MARGIN_PX, 0.5 * float(rim.max(initial=0)))
@@ -64,19 +65,10 @@ def read_blackbody(
     if not good.any():
         return None
     values = values[good]
-    slope = float(band.d_radiance_dT(T_K))
-    spread = max(mad_sigma(values - np.median(values)), 0.2 * netd_K * slope)
-    kept = values[np.abs(values - np.median(values)) <= 3 * spread]
-    expected = emissivity * float(band.radiance(T_K)) + (1 - emissivity) * L_reflected
-    return BlackbodyReading(
-        view=view,
-        measured=float(kept.mean()),
-        expected=expected,
-        sigma_measured=spread / np.sqrt(len(kept)),
-        sigma_expected=emissivity * slope * sigma_K,
-        u_px=float(u[deep][good].mean()),
-        v_px=float(v[deep][good].mean()),
-    )
+    spread = max(mad_sigma(values - np.median(values)), LEAST_SPREAD * netd_L)
+    kept = values[np.abs(values - np.median(values)) <= KEPT_SIGMAS * spread]
+    middle = float(u[deep][good].mean()), float(v[deep][good].mean())
+    return float(kept.mean()), spread / np.sqrt(len(kept)), *middle
 
 
 def _inside_polygon(shape: tuple[int, ...], polygon: Float) -> tuple[NDArray, NDArray, Float]:

@@ -1,17 +1,27 @@
-"""Signal, in-band radiance, temperature: the measurement equation, forwards and backwards.
+"""The measurement equation, forwards and backwards, and the paper's own correction.
 
 Inside the method everything is linear in in-band radiance L [W m-2 sr-1]; a temperature is computed once, at the end.
-Formulas, their sources and the golden values stand in docs/radiometry.md.
+Skin of radiance L_s in surroundings of radiance L_r, seen at the angle θ, leaves
+
+    L = L_r + E(θ)·x,      x = ε(0)·(L_s - L_r),      E = ε(θ)/ε(0),
+
+and the camera reports L' = τL + (1-τ)L_air + γ(L - L_pivot) + b + φ(u, v). x is the excess that the camera would report
+looking straight on: ε(0) plays no part until the end. Sources and golden values stand in docs/radiometry.md.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..types import Float
 
-# ---------------------------------------------------------------- the measurement equation
+# ---------------------------------------------------------------- forwards
+
+
+def excess_reading(x: ArrayLike, E: ArrayLike, offset: ArrayLike) -> NDArray:
+    """E·x + b: what a view reports above the reflected radiance, W m-2 sr-1; arguments broadcast."""
+    return np.asarray(np.asarray(E) * np.asarray(x) + np.asarray(offset))
 
 
 def apparent_radiance(
@@ -23,33 +33,56 @@ def apparent_radiance(
     L_air: ArrayLike = 0.0,
     offset: ArrayLike = 0.0,
 ) -> Float:
-    """What the camera reports: τ[ε L_s + (1-ε) L_r] + (1-τ) L_air + b, all W m-2 sr-1; arguments broadcast."""
-    eps, tau = np.asarray(epsilon), np.asarray(transmission)
-    leaving = eps * np.asarray(L_surface) + (1 - eps) * np.asarray(L_reflected)
+    """What the camera reports: τ[L_r + ε(L_s - L_r)] + (1-τ) L_air + b, all W m-2 sr-1; arguments broadcast.
+
+    With the normal-equivalent radiance in place of L_surface, epsilon is E(θ).
+    """
+    L_r, tau = np.asarray(L_reflected), np.asarray(transmission)
+    leaving = L_r + excess_reading(np.asarray(L_surface) - L_r, epsilon, 0.0)
     return np.asarray(tau * leaving + (1 - tau) * np.asarray(L_air) + np.asarray(offset))
+
+
+def with_gain(L: ArrayLike, gain: float, L_pivot: float) -> NDArray:
+    """Radiance as a camera of another gain about L_pivot reports it: L + γ(L - L_pivot), gain = 1 + γ; any shape."""
+    return np.asarray(gain * np.asarray(L) - (gain - 1) * L_pivot)
+
+
+# ---------------------------------------------------------------- backwards
 
 
 def leaving_radiance(
     L_apparent: ArrayLike, *, transmission: ArrayLike = 1.0, L_air: ArrayLike = 0.0, offset: ArrayLike = 0.0
 ) -> Float:
-    """Radiance that left the surface towards the camera: offset and air path removed."""
+    """Radiance that left the surface towards the camera: offset and air path removed, W m-2 sr-1; broadcast."""
     tau = np.asarray(transmission)
     return np.asarray((np.asarray(L_apparent) - np.asarray(offset) - (1 - tau) * np.asarray(L_air)) / tau)
 
 
-def normal_equivalent(L_leaving: ArrayLike, relative_epsilon: ArrayLike, L_reflected: ArrayLike) -> Float:
-    """What the camera would report looking straight on: L0 = L_r + (L - L_r)/E with E = ε(θ)/ε(0).
+def without_gain(L_reported: ArrayLike, offset: ArrayLike, gain: float, L_pivot: float) -> NDArray:
+    """Inverse of `with_gain` and a camera's offset, W m-2 sr-1; arguments broadcast."""
+    return np.asarray((np.asarray(L_reported) - offset + (gain - 1) * L_pivot) / gain)
 
-    Independent of ε(0); the radiance form of the paper's S step (Eqs. 26-27).
+
+def normal_equivalent(L_leaving: ArrayLike, relative_epsilon: ArrayLike, L_reflected: ArrayLike) -> Float:
+    """What the camera would report looking straight on: L0 = L_r + (L - L_r)/E with E = ε(θ)/ε(0), W m-2 sr-1.
+
+    Independent of ε(0); the radiance form of the paper's S step (Eqs. 26-27). Arguments broadcast.
     """
-    L_r = np.asarray(L_reflected)
-    return np.asarray(L_r + (np.asarray(L_leaving) - L_r) / np.asarray(relative_epsilon))
+    return absolute(L_leaving, relative_epsilon, L_reflected)
 
 
 def absolute(L_normal: ArrayLike, epsilon0: ArrayLike, L_reflected: ArrayLike) -> Float:
-    """Radiance of a blackbody at the surface's temperature: L_s = L_r + (L0 - L_r)/ε(0)."""
+    """Radiance of a blackbody at the surface's temperature: L_s = L_r + (L0 - L_r)/ε(0), W m-2 sr-1; broadcast."""
     L_r = np.asarray(L_reflected)
-    return np.asarray(L_r + (np.asarray(L_normal) - L_r) / np.asarray(epsilon0))
+    return surface_radiance(np.asarray(L_normal) - L_r, epsilon0, L_r)
+
+
+def surface_radiance(x: ArrayLike, epsilon: ArrayLike, L_reflected: ArrayLike) -> Float:
+    """L_r + x/ε of an excess x, W m-2 sr-1: a blackbody's at the surface's temperature, or (ε = 1) straight on."""
+    return np.asarray(np.asarray(L_reflected) + np.asarray(x) / np.asarray(epsilon))
+
+
+# ---------------------------------------------------------------- the paper's
 
 
 def paper_chain(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..geometry.outline import Contour, OutlineCaster, project_contour
 from ..geometry.rigid import invert
 from ..physics.signal import SignalConverter
+from ..progress import Progress, silent
 from ..robust import TUKEY, mad_sigma, tukey_weight
 from ..types import Camera, Float, Float32, SurfaceMesh, ThermalStream
 from .edges import find_edges, smooth_image
@@ -68,7 +69,7 @@ def read_outlines(
     mesh: SurfaceMesh,
     frames: Sequence[int],
     T_world_thermal: Float,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = silent,
 ) -> tuple[tuple[OutlineView, ...], Contrast | None]:
     """Images and model outlines of thermal frames at poses (N, 4, 4), and how the outline shows in them.
 
@@ -85,8 +86,7 @@ def read_outlines(
             range_m = float(np.median(np.linalg.norm(thinned.point_m - T_world_thermal[row, :3, 3], axis=1)))
             radiance = converter.radiance(stream.load(int(frame)), stream.places[frame])
             views.append(OutlineView(row, smooth_image(radiance), thinned, range_m))
-        if progress:
-            progress(row + 1, len(frames))
+        progress("rig", row + 1, len(frames))
     level = [float(np.nanmedian(v.smooth)) for v in views]
     if not np.isfinite(level).any():
         return tuple(views), None

@@ -34,7 +34,7 @@ MAX_WALK_M = 100.0  # a camera path longer across than this is in another unit
 
 
 @dataclass(frozen=True, eq=False)
-class FusionResult:
+class SurfaceResult:
     """A fused surface and how it came about.
 
     mesh : in world metres. voxel_m, truncation_m : of the grid. max_range_m : depth beyond it was not used.
@@ -64,7 +64,7 @@ def fuse_surface(
     progress: Progress | None = None,
     floor_plane: Float | None = None,
     frames: Frames | None = None,
-) -> FusionResult:
+) -> SurfaceResult:
     """Fuse a scan's depth frames into the surface of its subject.
 
     Parameters
@@ -103,7 +103,7 @@ def fuse_surface(
     color = None
     if recipe.fusion.color and scan.color is not None:
         color = color_vertices(scan, trajectory, vertices, normals, recipe.input.max_pose_gap_ms / 1e3)
-    return FusionResult(
+    return SurfaceResult(
         mesh=SurfaceMesh(vertices, triangles, normals, color),
         voxel_m=plan.voxel_m,
         truncation_m=plan.truncation_m,

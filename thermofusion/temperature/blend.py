@@ -16,13 +16,16 @@ from numpy.typing import NDArray
 
 from ..physics.band import ZERO_DEGC_K, Band
 from ..physics.emissivity import EmissivityModel, follows_shape
-from ..physics.equation import leaving_radiance, paper_chain
-from ..recipe import RadiometrySection
+from ..physics.equation import paper_chain, surface_radiance
+from ..recipe import TemperatureSection
 from ..types import Bool, Float, Float32, Int, Observations, OutputMode
-from .crosscal import CrosscalResult
-from .mean import Groups, RobustMean
+from .crosscal import Calibration
+from .mean import Groups, RobustMean, Solved
+from .problem import ThermalProblem
+from .room import Room
 from .uncertainty import (
     AngleTables,
+    Budget,
     ErrorModel,
     Levers,
     Uncertainty,
@@ -71,60 +74,16 @@ class BlendResult:
         }[self.output]
 
 
-def remove_air_path(observations: Observations, transmission_per_m: float, L_air: float) -> Observations:
-    """Observations with the air between surface and camera removed: L = (L' - (1-τ) L_air)/τ, τ = τ₁^range."""
-    if transmission_per_m == 1.0:
-        return observations
-    tau = np.float32(transmission_per_m) ** observations.range_m
-    columns = {k: getattr(observations, k) for k in observations.__dataclass_fields__}
-    columns["radiance"] = leaving_radiance(observations.radiance, transmission=tau, L_air=L_air).astype(np.float32)
-    return Observations(**columns)
-
-
-def blend(
-    observations: Observations,
-    n_vertices: int,
-    calibration: CrosscalResult | None,
-    emissivity: EmissivityModel,
-    band: Band,
-    *,
-    L_reflected: float | NDArray,
-    reflected_K: float,
-    air_K: float | None = None,
-    settings: RadiometrySection | None = None,
-    errors: ErrorModel | None = None,
-    max_angle_deg: float = 65.0,
-    last_resort_angle_deg: float = 75.0,
-    with_uncertainty: bool = True,
-) -> BlendResult:
+def blend(problem: ThermalProblem, calibration: Calibration | None, *, with_uncertainty: bool = True) -> BlendResult:
     """One temperature per vertex from all observations of it.
 
-    Parameters
-    ----------
-    observations : sorted by (view, vertex); radiance as the camera reports it, freed of the air path.
-    calibration : used by method `joint` only; its shape of ε(θ) replaces the model's.
-    emissivity : the recipe's model. L_reflected : radiance reflected by vertices, scalar or (V,).
-    reflected_K : temperature of the room's reflection (the paper's T_a). air_K : of the air, for the budget.
-    with_uncertainty : False for a first round whose temperatures only feed the next: no budget, NaN.
+    calibration : used by method `joint` only; its shape of ε(θ) replaces the model's. with_uncertainty : False for a
+    first round whose temperatures only feed the next: no budget, NaN.
     """
-    settings, errors = settings or RadiometrySection(), errors or ErrorModel()
-    calibration = calibration if settings.method == "joint" else None
-    task = _Task(
-        calibration=calibration,
-        given=emissivity,
-        model=calibration.emissivity(emissivity) if calibration else emissivity,
-        band=band,
-        reflected_K=reflected_K,
-        air_K=air_K,
-        settings=settings,
-        slope_L=calibration.slope_L if calibration else skin_slope(band, observations.radiance),
-        paper_S=_paper_scale(observations, emissivity, band, reflected_K) if settings.method == "paper" else 1.0,
-        distance_m=float(np.median(observations.range_m)) if len(observations) else 0.0,
-        with_uncertainty=with_uncertainty,
-    )
-    usable, oblique = _usable(observations, n_vertices, max_angle_deg, max(last_resort_angle_deg, max_angle_deg))
-    L_r = np.broadcast_to(np.asarray(L_reflected, np.float64), (n_vertices,))
-    gradient = np.broadcast_to(np.asarray(errors.gradient_K_per_m, np.float32), (n_vertices,))
+    observations, n_vertices = problem.observations, len(problem)
+    task = _Task.of(problem, calibration, with_uncertainty)
+    usable, oblique = _usable(problem)
+    gradient = np.broadcast_to(np.asarray(problem.errors.gradient_K_per_m, np.float32), (n_vertices,))
 
     def block(edges: tuple[int, int]) -> _Block:
         lo, hi = edges
@@ -132,10 +91,9 @@ def blend(
         groups, order = Groups.by_vertex(observations.vertex[mine] - np.int32(lo), hi - lo)
         groups = replace(groups, vertex=groups.vertex + np.int32(lo))
         rows = observations.select(mine[order])
-        local = replace(errors, gradient_K_per_m=gradient[groups.vertex])
-        return _blend(
-            replace(rows, vertex=groups.rows(np.arange(len(groups), dtype=np.int32))), groups, L_r, task, local
-        )
+        local = replace(problem.errors, gradient_K_per_m=gradient[groups.vertex])
+        rows = replace(rows, vertex=groups.rows(np.arange(len(groups), dtype=np.int32)))
+        return _blend(rows, groups, problem.L_reflected, task, local)
 
     rounds = max(1, -(-len(observations) // (THREADS * BLOCK)))  # whole rounds: no thread waits for the other
     edges = np.linspace(0, n_vertices, THREADS * rounds + 1).astype(int).tolist()
@@ -147,17 +105,33 @@ def blend(
 class _Task:
     """What a blend needs besides observations: the same for all blocks of vertices."""
 
-    calibration: CrosscalResult | None
+    calibration: Calibration | None
     given: EmissivityModel  # the recipe's
     model: EmissivityModel  # with the fitted shape
     band: Band
-    reflected_K: float
-    air_K: float | None
-    settings: RadiometrySection
+    room: Room
+    settings: TemperatureSection
     slope_L: float
     paper_S: float
     distance_m: float  # typical
     with_uncertainty: bool
+
+    @classmethod
+    def of(cls, problem: ThermalProblem, calibration: Calibration | None, with_uncertainty: bool) -> _Task:
+        rows, settings, given = problem.observations, problem.settings, problem.emissivity
+        calibration = calibration if settings.method == "joint" else None
+        return cls(
+            calibration=calibration,
+            given=given,
+            model=calibration.emissivity(given) if calibration else given,
+            band=problem.band,
+            room=problem.room,
+            settings=settings,
+            slope_L=calibration.slope_L if calibration else skin_slope(problem.band, rows.radiance),
+            paper_S=_paper_scale(rows, given, problem.band, problem.room) if settings.method == "paper" else 1.0,
+            distance_m=float(np.median(rows.range_m)) if len(rows) else 0.0,
+            with_uncertainty=with_uncertainty,
+        )
 
     @property
     def angle_corrected(self) -> bool:
@@ -204,44 +178,37 @@ def _blend(rows: Observations, groups: Groups, L_r: Float, task: _Task, errors: 
     else:
         mean = _robust_mean(rows, groups, L_r, task, errors)
         scale = task.calibration.residual_sigma if task.calibration and mean.statistical else None
-        x = mean.solve(robust=method == "joint", scale=scale)
-        L0, L_s = L_r + x, L_r + x / task.epsilon0
-        columns["residual"], spread = mean.scatter(x)
+        solved = mean.solve(robust=method == "joint", scale=scale)
+        x = solved.x
+        L0, L_s = surface_radiance(x, 1.0, L_r), surface_radiance(x, task.epsilon0, L_r)
+        columns["residual"], spread = mean.scatter(solved)
         columns["spread_K"] = spread / task.slope_L
         if task.with_uncertainty:
-            parts, common = _errors_of(rows, mean, x, band.temperature_K(L_s), columns, task, errors)
+            levers = _levers(rows, mean, solved, task, errors)
+            parts, common = _errors_of(levers, x, band.temperature_K(L_s), columns, task, errors)
     columns |= {"absolute_K": band.temperature_K(L_s), "normal_equivalent_K": band.temperature_K(L0)}
     return _Block(groups.vertex, columns, parts, common)
 
 
 def _errors_of(
-    rows: Observations,
-    mean: RobustMean,
-    x: Float,
-    T_K: Float,
-    columns: dict[str, NDArray],
-    task: _Task,
-    errors: ErrorModel,
+    levers: Levers, x: Float, T_K: Float, columns: dict[str, NDArray], task: _Task, errors: ErrorModel
 ) -> tuple[dict[str, NDArray], dict[str, NDArray]]:
     calibration = task.calibration
     fitted = calibration is not None and calibration.shape_sigma > 0
-    return vertex_uncertainty(
-        _levers(rows, mean, x, task, errors),
-        x,
-        T_K,
+    budget = Budget(
+        errors=errors,
         epsilon0=task.epsilon0,
         absolute=task.settings.output == "absolute" and task.angle_corrected,
         slope_L=task.slope_L,
-        slope_reflected=float(task.band.d_radiance_dT(task.reflected_K)),
-        errors=errors,
+        slope_reflected=float(task.band.d_radiance_dT(task.room.reflected_K)),
         shape_fitted=fitted,
         epsilon0_follows=fitted and follows_shape(task.given),
         reference_sigma_K=calibration.reference_sigma_K if calibration else np.nan,
-        air_K=task.air_K,
+        air_K=task.room.air_K,
         transmission_per_m=task.settings.transmission_per_m,
-        path_m=columns["distance_m"] - task.distance_m,
-        views_K=None if calibration else columns["spread_K"],
     )
+    views_K = None if calibration else columns["spread_K"]
+    return vertex_uncertainty(budget, levers, x, T_K, columns["distance_m"] - task.distance_m, views_K)
 
 
 def _assembled(blocks: list[_Block], oblique: Bool, n_vertices: int, task: _Task) -> BlendResult:
@@ -277,16 +244,17 @@ def _assembled(blocks: list[_Block], oblique: Bool, n_vertices: int, task: _Task
 # ---------------------------------------------------------------- which observations count
 
 
-def _usable(
-    observations: Observations, n_vertices: int, max_angle_deg: float, last_resort_angle_deg: float
-) -> tuple[Bool, Bool]:
+def _usable(problem: ThermalProblem) -> tuple[Bool, Bool]:
     """(rows that count, vertices that only oblique rows saw)."""
+    observations, n_vertices = problem.observations, len(problem)
+    max_angle_deg = problem.mapping.max_angle_deg
+    last_resort_angle_deg = max(problem.mapping.last_resort_angle_deg, max_angle_deg)
     measured = np.isfinite(observations.radiance)
     good = measured & (observations.cos_angle >= np.float32(np.cos(np.radians(max_angle_deg))))
     well_seen = np.zeros(n_vertices, bool)
     well_seen[observations.vertex[good]] = True
     last = measured & (observations.cos_angle >= np.float32(np.cos(np.radians(last_resort_angle_deg)))) & ~good
-    last &= ~well_seen[observations.vertex]
+    last &= ~well_seen[observations.vertex] & problem.counts
     oblique = np.zeros(n_vertices, bool)
     oblique[observations.vertex[last]] = True
     return good | last, oblique
@@ -297,20 +265,22 @@ def _single(rows: Observations, task: _Task) -> Float:
     L = rows.radiance.astype(np.float64)
     if task.settings.method == "nearest-view":
         return L
-    degC, ambient = task.band.temperature_K(L) - ZERO_DEGC_K, task.reflected_K - ZERO_DEGC_K
+    degC, ambient = task.band.temperature_K(L) - ZERO_DEGC_K, task.room.reflected_K - ZERO_DEGC_K
     epsilon = task.given(rows.cos_angle.astype(np.float64))
     _, scaled = paper_chain(degC, epsilon, ambient, S=task.paper_S)
     return task.band.radiance(scaled + ZERO_DEGC_K)
 
 
-def _paper_scale(rows: Observations, emissivity: EmissivityModel, band: Band, reflected_K: float) -> float:
+def _paper_scale(rows: Observations, emissivity: EmissivityModel, band: Band, room: Room) -> float:
     """The paper's S (Eq. 26): measured over corrected temperature, °C, where the surface faces the camera."""
     facing = np.flatnonzero(rows.cos_angle >= min(np.cos(np.radians(FACING_DEG)), rows.cos_angle.max(initial=0)))
     facing = facing[np.isfinite(rows.radiance[facing])][:: max(1, len(facing) // 100_000)]
     if not len(facing):
         return 1.0
     degC = band.temperature_K(rows.radiance[facing].astype(np.float64)) - ZERO_DEGC_K
-    corrected, _ = paper_chain(degC, emissivity(rows.cos_angle[facing].astype(np.float64)), reflected_K - ZERO_DEGC_K)
+    corrected, _ = paper_chain(
+        degC, emissivity(rows.cos_angle[facing].astype(np.float64)), room.reflected_K - ZERO_DEGC_K
+    )
     return float(np.median(degC) / np.median(corrected))
 
 
@@ -331,13 +301,13 @@ def _robust_mean(rows: Observations, groups: Groups, L_r: Float, task: _Task, er
     else:  # resolution: pixels per surface, proportional to cosθ/d²
         weight = np.float32(1e-6) / rows.footprint_m2
     weight = np.asarray(weight, np.float32)
-    return RobustMean(groups, np.asarray(y), E, weight, weight.copy(), statistical)
+    return RobustMean(groups, np.asarray(y), E, weight, statistical)
 
 
-def _levers(rows: Observations, mean: RobustMean, x: Float, task: _Task, errors: ErrorModel) -> Levers:
+def _levers(rows: Observations, mean: RobustMean, solved: Solved, task: _Task, errors: ErrorModel) -> Levers:
     """Σ over each vertex's rows of h times what an error does to a row, h = wE/ΣwE²."""
     groups, one = mean.groups, np.ones(len(rows), np.float32)
-    h = (mean.robust * mean.E / groups.rows(mean.denominator(mean.robust))).astype(np.float32)
+    h = (solved.weight * mean.E / groups.rows(mean.denominator(solved.weight))).astype(np.float32)
     slope = task.tables.slope(rows.cos_angle) if task.angle_corrected else 0 * one
     loss, mixed = (1 - mean.E).astype(np.float32), silhouette_share(rows.edge_px, errors)
     block = np.stack([one, loss, slope, registration_m(rows, errors), mixed], axis=1)
@@ -345,5 +315,7 @@ def _levers(rows: Observations, mean: RobustMean, x: Float, task: _Task, errors:
     squares = groups.weighted_sums(h * h, np.stack([one, slope * slope], axis=1))
     modes = np.zeros((len(groups), 0))
     if task.calibration:
-        modes = groups.weighted_sums(h, task.calibration.error_modes(MODES)(rows, groups.rows(x.astype(np.float32))))
+        modes = groups.weighted_sums(
+            h, task.calibration.error_modes(MODES)(rows, groups.rows(solved.x.astype(np.float32)))
+        )
     return Levers(squares[:, 0], sums[:, 0], sums[:, 1], sums[:, 2], squares[:, 1], sums[:, 3], sums[:, 4], modes)

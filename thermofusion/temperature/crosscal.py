@@ -21,14 +21,15 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from ..errors import ScanError
-from ..mapping.references import BlackbodyReading, ContactReading
-from ..physics.band import Band
 from ..physics.emissivity import AngleTable, EmissivityModel, reshaped, shape_direction
-from ..recipe import CrosscalSection
+from ..physics.equation import without_gain
 from ..types import Bool, Float, Float32, Observations
 from .field import ImageField
+from .layout import Layout
+from .problem import ThermalProblem
+from .references import ContactReading, ExpectedReading
 from .system import SHAPE_BOUNDS, ContactRow, KnownField, OverlapSystem, Solution, condition_number
-from .uncertainty import AngleTables, ErrorModel, covariance_modes, observation_variance, skin_slope
+from .uncertainty import AngleTables, covariance_modes, observation_variance, skin_slope
 
 FIELD_HELD = 0.7  # of the prior's sigma: a pattern of the field less certain than this is held at zero
 SHAPE_HELD = 0.5  # a shape less certain than half the way between the skin presets is held
@@ -41,7 +42,7 @@ ERROR_RASTER = 32  # cells along each side on which the field's error is evaluat
 
 
 @dataclass(frozen=True, eq=False)
-class CrosscalResult:
+class Calibration:
     """What the overlap of views settled. Radiances in W m-2 sr-1; `slope_L` (dL/dT) turns them into K.
 
     offset_radiance : (N_views,) b. field : φ(u, v). shape, shape_sigma : s of `emissivity.reshaped`. gain : 1 + γ about
@@ -74,6 +75,11 @@ class CrosscalResult:
     messages: tuple[str, ...]
 
     @property
+    def layout(self) -> Layout:
+        """Where the parameters stand in `covariance`."""
+        return Layout(len(self.offset_radiance), len(self.field.coefficients))
+
+    @property
     def offsets_K(self) -> Float:
         """(N_views,) offsets as temperatures at skin level."""
         return self.offset_radiance / self.slope_L
@@ -88,126 +94,88 @@ class CrosscalResult:
         camera = self.offset_radiance[observations.view]
         if np.any(self.field.coefficients):
             camera = camera + self.field(observations.u_px, observations.v_px)
-        return np.asarray((L - camera + (self.gain - 1) * self.pivot_radiance) / self.gain)
+        return without_gain(L, camera, self.gain, self.pivot_radiance)
 
     def error_modes(self, count: int) -> Callable[[Observations, NDArray], Float32]:
         """How the strongest error modes of this calibration shift observations: (rows, x of rows) -> (N, count)."""
         modes = covariance_modes(self.covariance, count).astype(np.float32)
-        M, n = len(self.offset_radiance), ERROR_RASTER
+        at, n = self.layout, ERROR_RASTER
         du, dv = self.field.width_px / n, self.field.height_px / n
         v, u = (np.mgrid[0:n, 0:n].reshape(2, -1) + 0.5) * np.array([[dv], [du]])
-        raster = (self.field.patterns(u, v) @ modes[M:-2]).astype(np.float32)
+        raster = (self.field.patterns(u, v) @ modes[at.field]).astype(np.float32)
         direction = AngleTable.of(shape_direction(AngleTable.knots()))
 
         def effect(rows: Observations, x: NDArray) -> Float32:
             cell = (rows.v_px / np.float32(dv)).astype(np.int32) * n + (rows.u_px / np.float32(du)).astype(np.int32)
             out = modes[rows.view] + raster[np.clip(cell, 0, n * n - 1)]
-            return np.asarray(out + (x * direction(rows.cos_angle))[:, None].astype(np.float32) * modes[-2])
+            return np.asarray(out + (x * direction(rows.cos_angle))[:, None].astype(np.float32) * modes[at.shape])
 
         return effect
 
 
-def cross_calibrate(
-    observations: Observations,
-    n_vertices: int,
-    n_views: int,
-    emissivity: EmissivityModel,
-    band: Band,
-    *,
-    image_size: tuple[int, int],
-    L_reflected: float | NDArray,
-    errors: ErrorModel | None = None,
-    settings: CrosscalSection | None = None,
-    max_angle_deg: float = 65.0,
-    blackbodies: Sequence[BlackbodyReading] = (),
-    contacts: Sequence[ContactReading] = (),
-    vertices_per_patch: float = 1.0,
-) -> CrosscalResult:
-    """Solve for offsets, field, shape and gain from all vertices that two or more views saw.
+def calibrate(problem: ThermalProblem) -> Calibration:
+    """Solve for offsets, field, shape and gain from all vertices that two or more views saw, clear of outlines.
 
-    Parameters
-    ----------
-    observations : sorted by (view, vertex); radiance freed of the air path. image_size : (width, height) px.
-    L_reflected : radiance that vertices reflect, scalar or (V,). errors : one-sigma parts that weight observations.
-    settings : `offsets = false` is one offset common to all views. max_angle_deg : steeper observations do not enter.
-    blackbodies : readings; they set the level together. contacts : set the level where no blackbody does.
-    vertices_per_patch : how many neighbouring vertices share their error (one window of normals, say). A million rows
-    are not a million witnesses: without it, noise is taken for a field wherever the image shows no skin.
-
-    Raises ScanError if no vertex was seen by two views.
+    Blackbodies set the level together, contact thermometers where no blackbody does. A million rows are not a million
+    witnesses: neighbouring vertices share their error (one window of normals), else noise would be taken for a field
+    wherever the image shows no skin. Raises ScanError if no vertex was seen by two views.
     """
-    errors, settings = errors or ErrorModel(), settings or CrosscalSection()
-    chosen = _choose(observations, n_vertices, settings.max_vertices, max_angle_deg, contacts)
-    L_r = np.broadcast_to(np.asarray(L_reflected, np.float64), (n_vertices,))
-    system = _system(chosen, n_views, emissivity, band, image_size, L_r, errors, settings, blackbodies, contacts)
-    seen = max(int((np.bincount(observations.vertex, minlength=n_vertices) >= 2).sum()), 1)
-    system = replace(system, correlated=max(1.0, vertices_per_patch * system.n_vertices / seen))
+    rows = problem.observations.select(problem.clear)
+    chosen = _choose(rows, problem)
+    system = _system(chosen, problem)
+    seen = max(int((np.bincount(rows.vertex, minlength=len(problem)) >= 2).sum()), 1)
+    system = replace(system, correlated=max(1.0, problem.vertices_per_patch * system.n_vertices / seen))
     solution = system.solve()
     reduced, held = _without_uncarried(system, solution)
+    settings = problem.settings.crosscal
     if settings.gain and not system.use_gain:
         held = ("gain", *held)
     if reduced is not system:
         system, solution = reduced, reduced.solve()
-    group = np.arange(n_views) if settings.offsets else np.zeros(n_views, np.intp)
-    return _result(system, solution, group, chosen, held, _shape_bias(system, emissivity, errors))
+    group = np.arange(problem.n_views) if settings.offsets else np.zeros(problem.n_views, np.intp)
+    bias = _shape_bias(problem.emissivity, problem.errors.sigma_normal_deg)
+    return _result(system, solution, group, chosen, held, bias)
 
 
-def _choose(
-    observations: Observations,
-    n_vertices: int,
-    max_vertices: int,
-    max_angle_deg: float,
-    contacts: Sequence[ContactReading],
-) -> Observations:
+def _choose(observations: Observations, problem: ThermalProblem) -> Observations:
     """Observations under the angle limit of an even sample of the vertices that two or more views saw."""
-    usable = observations.cos_angle >= np.float32(np.cos(np.radians(max_angle_deg)))
+    max_vertices = problem.settings.crosscal.max_vertices
+    usable = observations.cos_angle >= np.float32(np.cos(np.radians(problem.mapping.max_angle_deg)))
     usable &= np.isfinite(observations.radiance)
-    count = np.bincount(observations.vertex[usable], minlength=n_vertices)
+    count = np.bincount(observations.vertex[usable], minlength=len(problem))
     shared = np.flatnonzero(count >= 2)
     if not len(shared):
         raise ScanError(
             "no spot of the surface was seen well by two thermal views",
-            hint="cross-calibration needs overlap: choose another radiometry.method",
+            hint="cross-calibration needs overlap: choose another temperature.method",
         )
     stride = max(-(-len(shared) // max_vertices), -(-int(count[shared].sum()) // (max_vertices * ROWS_PER_VERTEX)))
-    wanted = np.zeros(n_vertices, bool)
+    wanted = np.zeros(len(problem), bool)
     wanted[shared[::stride]] = True
-    for contact in contacts:
+    for contact in problem.contacts:
         wanted[contact.vertices] = True
     return observations.select(usable & wanted[observations.vertex])
 
 
-def _system(
-    rows: Observations,
-    n_views: int,
-    emissivity: EmissivityModel,
-    band: Band,
-    image_size: tuple[int, int],
-    L_r: Float,
-    errors: ErrorModel,
-    settings: CrosscalSection,
-    blackbodies: Sequence[BlackbodyReading],
-    contacts: Sequence[ContactReading],
-) -> OverlapSystem:
-    """Columns of the least squares system."""
+def _system(rows: Observations, problem: ThermalProblem) -> OverlapSystem:
+    """The least squares system of chosen rows."""
+    errors, settings, blackbodies = problem.errors, problem.settings.crosscal, problem.blackbodies
+    L_r, image_size = problem.L_reflected, (problem.lens.width_px, problem.lens.height_px)
     numbers, vertex = np.unique(rows.vertex, return_inverse=True)
     order = np.argsort(vertex, kind="stable").astype(np.int32)
     count = np.bincount(vertex)
-    L, cos, tables = rows.radiance.astype(np.float64), rows.cos_angle, AngleTables.of(emissivity)
+    L, cos, tables = rows.radiance.astype(np.float64), rows.cos_angle, AngleTables.of(problem.emissivity)
     y = L - L_r[rows.vertex]
     # weights must not depend on the camera's common offset: what references say of it is taken off first
-    contact_rows = _contact_rows(contacts, numbers, L_r, emissivity.normal)
-    common = _common_offset(np.bincount(vertex, y) / count, blackbodies, contact_rows)
-    slope_L = skin_slope(band, L - common)
+    contacts = _contact_rows(problem.contacts, numbers, L_r, problem.emissivity.normal)
+    common = _common_offset(np.bincount(vertex, y) / count, blackbodies, contacts)
+    slope_L = skin_slope(problem.band, L - common)
     excess = (np.bincount(vertex, y - common) / count)[vertex]
     field = ImageField.zero(*image_size)
     K = len(field.coefficients) if settings.vignetting else 0
     expected = np.array([r.expected for r in blackbodies])
     use_gain = settings.gain and len(expected) > 1 and float(np.ptp(expected)) >= GAIN_SPAN_K * slope_L
     pivot = float(expected.mean()) if len(expected) else 0.0
-    columns = np.zeros((len(rows), K + 2))
-    columns[:, :K] = field.patterns(rows.u_px, rows.v_px)[:, :K]
-    columns[:, -1] = L_r[rows.vertex] - pivot if use_gain else 0.0  # what (1+γ)x leaves of γ
     return OverlapSystem(
         vertex=vertex.astype(np.int32),
         group=rows.view if settings.offsets else np.zeros(len(rows), np.int32),
@@ -215,25 +183,26 @@ def _system(
         E=tables.relative(cos),
         D=AngleTable.of(shape_direction(AngleTable.knots()), np.float64)(cos),
         sigma2=observation_variance(rows, excess, tables, errors, slope_L).astype(np.float64),
-        columns=columns,
+        patterns=field.patterns(rows.u_px, rows.v_px)[:, :K],
+        gain_column=L_r[rows.vertex] - pivot if use_gain else np.zeros(len(rows)),
         order=order,
         start=np.insert(np.cumsum(count), 0, 0).astype(np.int32),
-        n_groups=n_views if settings.offsets else 1,
+        n_groups=problem.n_views if settings.offsets else 1,
         field=field,
         keep=np.eye(len(field.coefficients))[:, :K],
         use_shape=settings.shape,
         use_gain=use_gain,
         slope_L=slope_L,
         pivot=pivot,
-        readings=tuple(blackbodies),
+        readings=blackbodies,
         reading_groups=tuple(r.view if settings.offsets else 0 for r in blackbodies),
-        contacts=tuple(contact_rows),
+        contacts=tuple(contacts),
         reading_places=_known_fields(rows, blackbodies, image_size) if blackbodies else (),
     )
 
 
 def _known_fields(
-    rows: Observations, readings: Sequence[BlackbodyReading], image_size: tuple[int, int]
+    rows: Observations, readings: Sequence[ExpectedReading], image_size: tuple[int, int]
 ) -> tuple[KnownField, ...]:
     """For each reading the nearest place at which skin was seen, so that the field is known: its own, mostly."""
     width, height = image_size
@@ -246,7 +215,7 @@ def _known_fields(
     good = (seen.sum(axis=1) >= SUPPORT_ROWS) & ((seen > 0).sum(axis=1) >= SUPPORT_VIEWS)
     v, u = np.divmod(np.flatnonzero(good), across)
 
-    def nearest(reading: BlackbodyReading) -> KnownField:
+    def nearest(reading: ExpectedReading) -> KnownField:
         if not len(u):
             return KnownField(reading.u_px, reading.v_px, np.inf)
         du = np.clip(reading.u_px, u * side, (u + 1) * side) - reading.u_px
@@ -272,7 +241,7 @@ def _contact_rows(
     return out
 
 
-def _common_offset(y_mean: Float, blackbodies: Sequence[BlackbodyReading], contacts: Sequence[ContactRow]) -> float:
+def _common_offset(y_mean: Float, blackbodies: Sequence[ExpectedReading], contacts: Sequence[ContactRow]) -> float:
     """A first guess of the offset common to all views; 0 without a reference."""
     if blackbodies:
         return float(np.mean([r.measured - r.expected for r in blackbodies]))
@@ -286,17 +255,17 @@ def _common_offset(y_mean: Float, blackbodies: Sequence[BlackbodyReading], conta
 
 def _without_uncarried(system: OverlapSystem, solution: Solution) -> tuple[OverlapSystem, tuple[str, ...]]:
     """The system without the parameters whose own uncertainty says that the overlap does not carry them."""
-    M, K, _ = system.sizes
-    held, keep, use_shape = [], system.keep, system.use_shape
+    at = system.layout
+    K, held, keep, use_shape = at.n_patterns, [], system.keep, system.use_shape
     if K:
         # in units of what was known before: a combination of patterns that the data tell nothing of keeps a sigma of 1
         prior = np.sqrt(1 / np.diag(system.field_prior()))
-        values, vectors = np.linalg.eigh(solution.covariance[M : M + K, M : M + K] / np.outer(prior, prior))
+        values, vectors = np.linalg.eigh(solution.covariance[at.field, at.field] / np.outer(prior, prior))
         carried = np.sqrt(np.maximum(values, 0)) < FIELD_HELD
         if not carried.all():
             keep = keep @ (prior[:, None] / prior.max() * vectors[:, carried])
             held.append(f"{int((~carried).sum())} of {K} field patterns")
-    if use_shape and np.sqrt(solution.covariance[M + K, M + K]) > SHAPE_HELD:
+    if use_shape and np.sqrt(solution.covariance[at.shape, at.shape]) > SHAPE_HELD:
         use_shape = False
         held.append("shape")
     if not held:
@@ -304,11 +273,11 @@ def _without_uncarried(system: OverlapSystem, solution: Solution) -> tuple[Overl
     return system.without(keep, use_shape=use_shape), tuple(held)
 
 
-def _shape_bias(system: OverlapSystem, emissivity: EmissivityModel, errors: ErrorModel) -> float:
+def _shape_bias(emissivity: EmissivityModel, sigma_normal_deg: float) -> float:
     """What noise of the normals can do to s: E averaged over it is E + ½E″σ², projected on D under 65°."""
     theta, h = np.radians(np.arange(1.0, 65.0)), 1e-3
     E = [emissivity.relative(np.cos(theta + d)) for d in (-h, 0.0, h)]
-    bend = 0.5 * np.radians(errors.sigma_normal_deg) ** 2 * (E[0] - 2 * E[1] + E[2]) / h**2
+    bend = 0.5 * np.radians(sigma_normal_deg) ** 2 * (E[0] - 2 * E[1] + E[2]) / h**2
     D = shape_direction(np.cos(theta))
     return float(bend @ D / (D @ D))
 
@@ -320,32 +289,34 @@ def _result(
     rows: Observations,
     held: tuple[str, ...],
     shape_bias: float,
-) -> CrosscalResult:
+) -> Calibration:
     """The solution in terms of views and the whole field."""
-    M, K, _ = system.sizes
-    n, slope = len(group), system.slope_L
-    expand = np.zeros((n + len(system.keep) + 2, M + K + 2))
+    at, n, slope = system.layout, len(group), system.slope_L
+    whole = Layout(n, len(system.keep))
+    expand = np.zeros((whole.size, at.size))
     expand[np.arange(n), group] = 1.0
-    expand[n:-2, M : M + K] = system.keep
-    expand[-2, -2], expand[-1, -1] = float(system.use_shape), float(system.use_gain)
+    expand[whole.field, at.field] = system.keep
+    expand[whole.shape, at.shape], expand[whole.gain, at.gain] = float(system.use_shape), float(system.use_gain)
     p, covariance = expand @ solution.p, expand @ solution.covariance @ expand.T
     level_sigma = _level_sigma(system, solution)
     shape_sigma = 0.0
     if system.use_shape:
         # a relative result's level is off by the mean of the true offsets, and takes s along
-        off = float(np.sqrt(solution.level_variance)) if system.anchored else float(np.std(p[:n]))
-        shape_sigma = float(np.sqrt(covariance[-2, -2] + (solution.level_gain[-2] * off) ** 2 + shape_bias**2))
+        off = float(np.sqrt(solution.level_variance)) if system.anchored else float(np.std(p[whole.offsets]))
+        shape_sigma = float(
+            np.sqrt(covariance[whole.shape, whole.shape] + (solution.level_gain[at.shape] * off) ** 2 + shape_bias**2)
+        )
     residual = (system.y - system.predict(solution.p, solution.x)) / slope
     robust = solution.weight * system.sigma2
     total = np.bincount(rows.view, robust, n)
     with np.errstate(invalid="ignore", divide="ignore"):
         view_rms = np.sqrt(np.bincount(rows.view, robust * residual**2, n) / np.where(total > 0, total, np.nan))
-    return CrosscalResult(
-        offset_radiance=p[:n],
-        field=replace(system.field, coefficients=p[n:-2]),
-        shape=float(p[-2]),
+    return Calibration(
+        offset_radiance=p[whole.offsets],
+        field=replace(system.field, coefficients=p[whole.field]),
+        shape=float(p[whole.shape]),
         shape_sigma=shape_sigma,
-        gain=1 + float(p[-1]),
+        gain=1 + float(p[whole.gain]),
         pivot_radiance=system.pivot,
         covariance=covariance,
         slope_L=slope,
@@ -355,7 +326,7 @@ def _result(
         residual_sigma=solution.scale,
         view_rms_K=view_rms,
         outlier_fraction=float(1 - np.mean(solution.weight > 0)),
-        condition=condition_number(solution.normal[:M, :M]),
+        condition=condition_number(solution.normal[at.offsets, at.offsets]),
         held=held,
         iterations=solution.iterations,
         converged=solution.converged,
@@ -367,10 +338,10 @@ def _level_sigma(system: OverlapSystem, solution: Solution) -> float:
     """One sigma of the common level of all vertices, K; NaN for a relative result."""
     if not system.anchored:
         return float("nan")
-    M, K, P = system.sizes
-    g, w = np.zeros(P), solution.weight / solution.weight.sum()
-    g[:M] = np.bincount(system.group, w, M)
-    g[M : M + K] = w @ system.columns[:, :K]
+    at = system.layout
+    g, w = np.zeros(at.size), solution.weight / solution.weight.sum()
+    g[at.offsets] = np.bincount(system.group, w, at.n_offsets)
+    g[at.field] = w @ system.patterns
     return float(np.sqrt(g @ solution.covariance @ g + solution.level_variance) / system.slope_L)
 
 
@@ -384,7 +355,7 @@ def _messages(system: OverlapSystem, solution: Solution, held: tuple[str, ...], 
         out.append(f"held, because the overlap does not carry it: {', '.join(held)}")
     if groups > 1:
         out.append(f"the views fall into {groups} groups that share no surface: their levels are not tied")
-    if system.use_shape and not SHAPE_BOUNDS[0] < solution.p[-2] < SHAPE_BOUNDS[1]:
+    if system.use_shape and not SHAPE_BOUNDS[0] < solution.p[system.layout.shape] < SHAPE_BOUNDS[1]:
         out.append("the shape of ε(θ) ran to its bound: check normals, angle limit and reflected temperature")
     return tuple(out)
 

@@ -67,69 +67,74 @@ class Groups:
 
 
 @dataclass(frozen=True, eq=False)
+class Solved:
+    """Of a robust mean: x (G,), and the weight (N,) that each row had in the end."""
+
+    x: Float
+    weight: Float32
+
+
+@dataclass(frozen=True, eq=False)
 class RobustMean:
     """Rows of y = E·x with weights: x is a vertex's normal-equivalent excess over what it reflects.
 
-    weight : statistical (1/σ² in radiance) or geometric. robust : weight in the end; written by `solve`.
+    weight : (N,) statistical (1/σ² in radiance) or geometric.
     """
 
     groups: Groups
     y: Float
     E: Float
     weight: Float32
-    robust: Float32
     statistical: bool
 
-    def solve(self, *, robust: bool, scale: float | None = None) -> Float:
-        """x (G,). Robust: weights of an L1 fit, then Tukey's.
+    def solve(self, *, robust: bool, scale: float | None = None) -> Solved:
+        """x of all groups. Robust: weights of an L1 fit, then Tukey's.
 
         scale : of residuals over the rows' own σ; None = taken from the residuals.
         """
-        x = self._estimate(self.weight)
+        x, weight = self._estimate(self.weight), self.weight
         if not robust or not len(x):
-            return x
+            return Solved(x, weight)
         root = np.sqrt(self.weight if self.statistical else self.weight / np.float32(np.median(self.weight)))
         sample = self._scale_rows() if scale is None else None
         for _ in range(L1_STEPS):
-            self._reweight(x, root, L1_FLOOR * (scale or self._scale(x, root, sample)), huber_weight)
-            x = self._estimate(self.robust)
-        l1 = self.robust.copy()
+            weight = self._weights(x, root, L1_FLOOR * (scale or self._scale(x, root, sample)), huber_weight)
+            x = self._estimate(weight)
+        l1 = weight
         for _ in range(TUKEY_STEPS):
-            self._reweight(x, root, TUKEY * (scale or self._scale(x, root, sample)), tukey_weight)
-            self._keep_measured(l1)
-            x = self._estimate(self.robust)
-        return x
+            weight = self._weights(x, root, TUKEY * (scale or self._scale(x, root, sample)), tukey_weight)
+            weight = self._measured_kept(weight, l1)
+            x = self._estimate(weight)
+        return Solved(x, weight)
 
     def residual(self, x: Float) -> Float32:
-        """y - E·x of all rows."""
+        """y - E·x of all rows (N,), W m-2 sr-1, of the groups' x (G,)."""
         return np.asarray(self.y - self.E * self.groups.rows(x), np.float32)
 
     def denominator(self, weight: Float32) -> Float:
-        """Σ w E² per group."""
+        """Σ w E² per group (G,), of rows' weights (N,)."""
         return self.groups.sums(weight * self.E * self.E)
 
-    def scatter(self, x: Float) -> tuple[Float, Float]:
-        """Per group: rms of residuals in sigmas of the rows' own errors, and in radiance; NaN with one row only."""
-        squares, n = self.residual(x) ** 2, self.groups.count
+    def scatter(self, solved: Solved) -> tuple[Float, Float]:
+        """Per group (G,): rms of residuals in sigmas of the rows' own errors, and in radiance; NaN with one row only."""
+        squares, n = self.residual(solved.x) ** 2, self.groups.count
         freedom = np.where(n > 1, n - 1, np.nan)
         sigmas = np.sqrt(self.groups.sums(self.weight * squares) / freedom)
-        spread = self.groups.sums(self.robust * squares) / self.groups.sums(self.robust)
+        spread = self.groups.sums(solved.weight * squares) / self.groups.sums(solved.weight)
         return sigmas, np.sqrt(spread * n / freedom)
 
     def _estimate(self, weight: Float32) -> Float:
         wE = weight * self.E
         return self.groups.sums(wE * self.y) / self.groups.sums(wE * self.E)
 
-    def _reweight(self, x: Float, root: Float32, reach: float, factor: Callable[[NDArray], NDArray]) -> None:
+    def _weights(self, x: Float, root: Float32, reach: float, factor: Callable[[NDArray], NDArray]) -> Float32:
         """Weights times a factor of the standardised residual in units of `reach`."""
-        self.robust[:] = self.weight * factor(np.abs(self.residual(x)) * root / np.float32(reach))
+        return np.asarray(self.weight * factor(np.abs(self.residual(x)) * root / np.float32(reach)), np.float32)
 
-    def _keep_measured(self, l1: Float32) -> None:
-        """Vertices on which all rows contradict each other keep the weights of the L1 fit."""
-        lost = self.groups.sums(self.robust) < LEAST_WEIGHT * self.groups.sums(self.weight)
-        if lost.any():
-            rows = self.groups.rows(lost)
-            self.robust[rows] = l1[rows]
+    def _measured_kept(self, weight: Float32, l1: Float32) -> Float32:
+        """The weights; vertices on which all rows contradict each other keep those of the L1 fit."""
+        lost = self.groups.sums(weight) < LEAST_WEIGHT * self.groups.sums(self.weight)
+        return np.where(self.groups.rows(lost), l1, weight) if lost.any() else weight
 
     def _scale_rows(self) -> tuple[NDArray, Float]:
         """Rows that the robust scale is taken from, and what makes up for their vertex's own freedom.

@@ -11,10 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from ..mapping.references import BlackbodyReading
+from ..physics.equation import excess_reading
 from ..robust import HUBER, MAD_PER_SIGMA, TUKEY, huber_weight, tukey_weight
 from ..types import Float, Int
 from .field import ImageField
+from .layout import Layout
+from .references import ExpectedReading
 
 HUBER_STEPS, TUKEY_STEPS = 4, 40
 CONVERGED_K = 1e-4  # a hundredth of what any result is good to
@@ -81,7 +83,8 @@ class ContactRow:
 class OverlapSystem:
     """Rows y = (E + s·D)·x[vertex] + b[group] + φ + γ·(L_r - pivot), with variances; vertices numbered without gaps.
 
-    x holds the camera's gain 1 + γ. columns : (N, K + 2): field patterns, D·x of the last step, L_r - pivot.
+    x holds the camera's gain 1 + γ. patterns : (N, K) of the field. gain_column : (N,) L_r - pivot, what (1+γ)x leaves
+    of γ; zero where no gain is solved for.
     group : (N,) the offset's index. keep : (K_all, K) combinations of the field's patterns that are solved for.
     order, start : rows by vertex. reading_places : where the field is taken for each reading. correlated : how many
     vertices err alike (neighbours share their normal, and all share rig and shape): the data's information is divided
@@ -94,7 +97,8 @@ class OverlapSystem:
     E: Float
     D: Float
     sigma2: Float
-    columns: Float
+    patterns: Float
+    gain_column: Float
     order: Int
     start: Int
     n_groups: int
@@ -104,16 +108,16 @@ class OverlapSystem:
     use_gain: bool
     slope_L: float
     pivot: float
-    readings: tuple[BlackbodyReading, ...]
+    readings: tuple[ExpectedReading, ...]
     reading_groups: tuple[int, ...]
     contacts: tuple[ContactRow, ...]
     reading_places: tuple[KnownField, ...] = ()
     correlated: float = 1.0
 
     @property
-    def sizes(self) -> tuple[int, int, int]:
-        """M offsets, K field patterns, P parameters."""
-        return self.n_groups, self.keep.shape[1], self.n_groups + self.keep.shape[1] + 2
+    def layout(self) -> Layout:
+        """Where the parameters stand."""
+        return Layout(self.n_groups, self.keep.shape[1])
 
     @property
     def n_vertices(self) -> int:
@@ -124,26 +128,26 @@ class OverlapSystem:
         return bool(self.readings or self.contacts)
 
     def without(self, keep: Float, *, use_shape: bool) -> OverlapSystem:
-        """The system with fewer combinations of field patterns, or without the shape."""
-        K = self.keep.shape[1]
-        columns = np.concatenate([self.columns[:, :K] @ (self.keep.T @ keep), self.columns[:, K:]], axis=1)
-        return replace(self, keep=keep, columns=np.ascontiguousarray(columns), use_shape=use_shape)
+        """The system with fewer combinations of field patterns, keep (K_all, K), or without the shape."""
+        patterns = np.ascontiguousarray(self.patterns @ (self.keep.T @ keep))
+        return replace(self, keep=keep, patterns=patterns, use_shape=use_shape)
 
     # ---------------------------------------------------------------- iteration
 
     def solve(self) -> Solution:
         """Iteratively reweighted least squares: Huber to a first estimate, weighted medians per vertex, then Tukey."""
-        M, K, P = self.sizes
-        p = np.zeros(P)
+        at = self.layout
+        p = np.zeros(at.size)
+        columns = np.column_stack([self.patterns, np.zeros(len(self.y)), self.gain_column])
         x = np.bincount(self.vertex, self.y) / np.diff(self.start)
         weight, scale = self._robust(p, x, huber=True)
         converged, n = False, 0
         while not converged and n < HUBER_STEPS + TUKEY_STEPS:
             n += 1
             before = p
-            p, x, covariance, normal, gain, variance = self._step(p, x, weight)
+            p, x, covariance, normal, gain, variance = self._step(p, x, weight, columns)
             change = np.abs(p - before)
-            change[: M + K] /= self.slope_L
+            change[at.linear] /= self.slope_L
             converged = n > HUBER_STEPS + 1 and bool(change.max() < CONVERGED_K)
             if n == HUBER_STEPS:
                 x = self._medians(p)
@@ -152,15 +156,15 @@ class OverlapSystem:
         return Solution(p, x, covariance * scale**2, normal, weight, scale, gain, variance, n, converged)
 
     def predict(self, p: Float, x: Float | float) -> Float:
-        """The model of y, (N,)."""
-        M, K, _ = self.sizes
+        """The measurement equation for y, (N,) W m-2 sr-1, of parameters p (P,) and excesses x (V,), or one for all."""
+        at = self.layout
         at_rows = x[self.vertex] if isinstance(x, np.ndarray) else x
-        out = (self.E + p[M + K] * self.D) * at_rows + p[self.group]
-        if K:
-            out += self.columns[:, :K] @ p[M : M + K]
+        out = excess_reading(at_rows, self.E + p[at.shape] * self.D, p[self.group])
+        if at.n_patterns:
+            out += self.patterns @ p[at.field]
         if self.use_gain:
-            out += p[-1] * self.columns[:, -1]
-        return np.asarray(out)
+            out += p[at.gain] * self.gain_column
+        return out
 
     def _robust(self, p: Float, x: Float, *, huber: bool) -> tuple[Float, float]:
         """Weights 1/σ² times the robust factor, and the scale of standardised residuals."""
@@ -173,8 +177,7 @@ class OverlapSystem:
 
     def _medians(self, p: Float) -> Float:
         """Weighted median of x per vertex, all else given."""
-        M, K, _ = self.sizes
-        E = self.E + p[M + K] * self.D
+        E = self.E + p[self.layout.shape] * self.D
         value = (self.y - self.predict(p, 0.0)) / E
         order = np.lexsort((value, self.vertex))
         w = np.cumsum((E / self.sigma2)[order])
@@ -183,13 +186,18 @@ class OverlapSystem:
         half = np.searchsorted(w, 0.5 * (begin + total))
         return np.asarray(value[order][np.minimum(half, self.start[1:] - 1)])
 
-    def _step(self, p: Float, x: Float, w: Float) -> tuple[Float, Float, Float, Float, Float, float]:
-        """One Gauss-Newton step with x eliminated: p, x, covariance, normal matrix, dp/d(level), level variance."""
-        M, K, P = self.sizes
-        s, G = p[M + K], self.columns
+    def _step(self, p: Float, x: Float, w: Float, G: Float) -> tuple[Float, Float, Float, Float, Float, float]:
+        """One Gauss-Newton step with x eliminated: p, x, covariance, normal matrix, dp/d(level), level variance.
+
+        G : (N, K + 2) derivatives by field, shape and gain; the shape's column is filled here.
+        """
+        at = self.layout
+        M, P = at.n_offsets, at.size
+        s = p[at.shape]
         E = self.E + s * self.D
-        G[:, K] = self.D * x[self.vertex] if self.use_shape else 0.0
-        y = self.y + s * G[:, K]  # s enters as s_old + δ: give back what the linearisation at s_old took
+        bend = at.n_patterns
+        G[:, bend] = self.D * x[self.vertex] if self.use_shape else 0.0
+        y = self.y + s * G[:, bend]  # s enters as s_old + δ: give back what the linearisation at s_old took
 
         wE = w * E
         by_vertex = csr_matrix((wE[self.order], self.order, self.start), shape=(self.n_vertices, len(w)))
@@ -198,17 +206,17 @@ class OverlapSystem:
         c = by_vertex @ y
         B = np.empty((len(a), P))
         to_group = (by_vertex.data, self.group[self.order], self.start)
-        B[:, :M] = csr_matrix(to_group, shape=(len(a), M)).toarray()
-        B[:, M:] = by_vertex @ G
+        B[:, at.offsets] = csr_matrix(to_group, shape=(len(a), M)).toarray()
+        B[:, at.shared] = by_vertex @ G
 
         wG = w[:, None] * G
         by_group = csr_matrix((np.ones(len(w)), self.group, np.arange(len(w) + 1)), shape=(len(w), M)).T
         N, rhs = np.zeros((P, P)), np.empty(P)
         N[np.arange(M), np.arange(M)] = by_group @ w
-        N[:M, M:] = by_group @ wG
-        N[M:, :M] = N[:M, M:].T
-        N[M:, M:] = G.T @ wG
-        rhs[:M], rhs[M:] = by_group @ (w * y), wG.T @ y
+        N[at.offsets, at.shared] = by_group @ wG
+        N[at.shared, at.offsets] = N[at.offsets, at.shared].T
+        N[at.shared, at.shared] = G.T @ wG
+        rhs[at.offsets], rhs[at.shared] = by_group @ (w * y), wG.T @ y
 
         level = self._level(a, c, B)
         N -= B.T @ (B / a[:, None])
@@ -217,7 +225,7 @@ class OverlapSystem:
         rhs /= self.correlated
         self._add_priors(N, rhs)
         p, covariance, level_gain = constrained_minimum(N, rhs, level.row, level.target)
-        p[M + K] = np.clip(p[M + K], *SHAPE_BOUNDS)
+        p[at.shape] = np.clip(p[at.shape], *SHAPE_BOUNDS)
         return p, (c - B @ p) / a, covariance, N, level_gain, level.variance
 
     def field_prior(self) -> Float:
@@ -227,11 +235,12 @@ class OverlapSystem:
 
     def _add_priors(self, N: Float, rhs: Float) -> None:
         """Weak knowledge that only matters where the overlap has none, never about the common level."""
-        M, K, P = self.sizes
-        N[:M, :M] += (OFFSET_PRIOR_K * self.slope_L) ** -2 * (np.eye(M) - 1 / M)
-        N[M : M + K, M : M + K] += self.field_prior()
-        N[P - 2, P - 2] += SHAPE_PRIOR**-2
-        N[P - 1, P - 1] += GAIN_PRIOR**-2
+        at = self.layout
+        M = at.n_offsets
+        N[at.offsets, at.offsets] += (OFFSET_PRIOR_K * self.slope_L) ** -2 * (np.eye(M) - 1 / M)
+        N[at.field, at.field] += self.field_prior()
+        N[at.shape, at.shape] += SHAPE_PRIOR**-2
+        N[at.gain, at.gain] += GAIN_PRIOR**-2
         if self.readings:
             level = self._mean_reading()
             for reading, row, weight in self._reading_rows():
@@ -241,17 +250,16 @@ class OverlapSystem:
 
     # ---------------------------------------------------------------- the level
 
-    def _reading_rows(self) -> list[tuple[BlackbodyReading, Float, float]]:
+    def _reading_rows(self) -> list[tuple[ExpectedReading, Float, float]]:
         """Each reading with its derivative by the parameters and its weight."""
-        M, K, P = self.sizes
-        out = []
+        at, out = self.layout, []
         for reading, group, place in zip(self.readings, self.reading_groups, self._places(), strict=True):
-            row = np.zeros(P)
+            row = np.zeros(at.size)
             row[group] = 1.0
             if np.isfinite(place.away):
-                at = self.field.patterns(np.array([place.u_px]), np.array([place.v_px]))
-                row[M : M + K] = (at @ self.keep)[0]
-            row[-1] = reading.expected - self.pivot if self.use_gain else 0.0
+                patterns = self.field.patterns(np.array([place.u_px]), np.array([place.v_px]))
+                row[at.field] = (patterns @ self.keep)[0]
+            row[at.gain] = reading.expected - self.pivot if self.use_gain else 0.0
             out.append((reading, row, 1 / (reading.sigma_measured**2 + (READING_FLOOR_K * self.slope_L) ** 2)))
         return out
 
@@ -279,7 +287,7 @@ class OverlapSystem:
             targets = np.array([np.mean(c[k.vertices] / a[k.vertices]) - k.expected for k in self.contacts])
             share = w / w.sum()
             return Level(share @ np.array(rows), float(share @ targets), float(1 / w.sum()))
-        M, _, P = self.sizes
+        M, P = self.layout.n_offsets, self.layout.size
         return Level(np.concatenate([np.full(M, 1 / M), np.zeros(P - M)]), 0.0, 0.0)
 
 

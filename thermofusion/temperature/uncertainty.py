@@ -14,8 +14,15 @@ from scipy.special import erfc
 
 from ..physics.band import Band
 from ..physics.emissivity import AngleTable, EmissivityModel
-from ..types import Float, Float32, Observations
+from ..recipe import TemperatureSection
+from ..types import Float, Float32, Observations, ThermalCamera
 
+DEFAULT_SIGMA_NORMAL_DEG = 2.0  # of normals over a 25 mm window of a Kinect's surface
+DEFAULT_PSF_PX = 0.7  # point spread of a microbolometer camera in focus, where it was not measured
+EDGE_MARGIN_PX = 0.5  # fused surfaces shrink or swell by about this much of a thermal pixel
+BILINEAR_VARIANCE = 4 / 9  # mean over sub-pixel positions of the noise variance left by bilinear sampling
+AIR_LOSS_PER_M = 0.006  # 1-τ of a metre of room air at 50 % humidity, 7.5-13.5 µm (62 mK at 10 K contrast)
+LINKED_EPSILON0_SIGMA = 0.003  # of ε(0) where it follows the fitted shape of a smooth surface
 MAX_LEVER = 4.0  # bound on a normal error's lever near grazing, where the linear form no longer holds
 
 
@@ -30,15 +37,29 @@ class ErrorModel:
     silhouettes; edge_margin_px : how much nearer a silhouette may be than the mesh says.
     """
 
-    netd_K: float = 0.05
-    sigma_normal_deg: float = 2.0
-    sigma_shape: float = 0.15
-    sigma_registration_px: float = 0.5
-    sigma_reflected_K: float = 1.0
+    netd_K: float
+    sigma_normal_deg: float
+    sigma_shape: float
+    sigma_registration_px: float
+    sigma_reflected_K: float
+    sigma_emissivity0: float
+    psf_sigma_px: float = DEFAULT_PSF_PX
+    edge_margin_px: float = EDGE_MARGIN_PX
     gradient_K_per_m: float | Float32 = 0.0
-    sigma_emissivity0: float = 0.01
-    psf_sigma_px: float = 0.7
-    edge_margin_px: float = 0.5
+
+    @classmethod
+    def of(cls, camera: ThermalCamera, settings: TemperatureSection) -> ErrorModel:
+        """From the camera and the recipe."""
+        normal = settings.sigma_normal_deg
+        return cls(
+            netd_K=camera.netd_K,
+            sigma_normal_deg=DEFAULT_SIGMA_NORMAL_DEG if normal is None else normal,
+            sigma_shape=settings.sigma_shape,
+            sigma_registration_px=settings.sigma_registration_px,
+            sigma_reflected_K=settings.sigma_reflected_K,
+            sigma_emissivity0=settings.sigma_emissivity0,
+            psf_sigma_px=DEFAULT_PSF_PX if camera.psf_sigma_px is None else camera.psf_sigma_px,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,56 +201,68 @@ class Levers:
     modes: Float
 
 
+@dataclass(frozen=True, eq=False)
+class Budget:
+    """What the errors of all vertices have in common.
+
+    epsilon0 : 1 where nothing is corrected. absolute : the output is divided by ε(0), else normal-equivalent. slope_L,
+    slope_reflected : dL/dT at skin's and at the room's temperature, W m-2 sr-1 K-1. shape_fitted : ε(θ)'s shape was
+    solved for; epsilon0_follows : ε(0) with it. reference_sigma_K : of the level, NaN without a reference.
+    """
+
+    errors: ErrorModel
+    epsilon0: float
+    absolute: bool
+    slope_L: float
+    slope_reflected: float
+    shape_fitted: bool
+    epsilon0_follows: bool
+    reference_sigma_K: float
+    air_K: float
+    transmission_per_m: float
+
+    @property
+    def divisor(self) -> float:
+        """What the excess x is divided by on its way to the output, dimensionless."""
+        return self.epsilon0 if self.absolute else 1.0
+
+
 def vertex_uncertainty(
-    levers: Levers,
-    x: Float,
-    T_K: Float,
-    *,
-    epsilon0: float,
-    absolute: bool,
-    slope_L: float,
-    slope_reflected: float,
-    errors: ErrorModel,
-    shape_fitted: bool,
-    epsilon0_follows: bool,
-    reference_sigma_K: float,
-    air_K: float | None,
-    transmission_per_m: float,
-    path_m: NDArray,
-    views_K: NDArray | None,
+    budget: Budget, levers: Levers, x: Float, T_K: Float, path_m: NDArray, views_K: NDArray | None
 ) -> tuple[dict[str, NDArray], dict[str, NDArray]]:
     """Errors of each vertex, K: (parts, signed effects of what is common), for `Uncertainty.of`.
 
-    x : (V,) normal-equivalent excess. absolute : the output is divided by ε(0), else normal-equivalent. path_m : (V,)
-    distance beyond the typical one. The budget is that of docs/radiometry.md.
+    x : (V,) normal-equivalent excess, W m-2 sr-1. T_K : (V,) K. path_m : (V,) distance beyond the typical one, m.
+    views_K : (V,) spread of views that were not calibrated, K. The budget is that of docs/radiometry.md.
     """
-    scale = 1 / (slope_L * (epsilon0 if absolute else 1.0))  # radiance of x -> K of the output
+    b, errors = budget, budget.errors
+    scale = 1 / (b.slope_L * b.divisor)  # radiance of x -> K of the output
     zero = np.zeros(len(x))
     normal = np.radians(errors.sigma_normal_deg)
     # An error of a normal tilts the surface to some views and away from others: between coherent and independent.
     tilt = np.sqrt(0.5 * (levers.slope**2 + levers.slope_squared))
-    reflected = 1 - levers.total / (epsilon0 if absolute else 1.0)  # dL_s/dL_r
-    sigma_epsilon0 = (
-        min(errors.sigma_emissivity0, LINKED_EPSILON0_SIGMA) if epsilon0_follows else errors.sigma_emissivity0
-    )
+    reflected = 1 - levers.total / b.divisor  # dL_s/dL_r
+    sigma_epsilon0 = errors.sigma_emissivity0
+    if b.epsilon0_follows:
+        sigma_epsilon0 = min(sigma_epsilon0, LINKED_EPSILON0_SIGMA)
     # The level comes from a reference (or is relative), so only the path's differences count; a corrected path is taken
     # to be right to a third of itself.
-    air_loss = AIR_LOSS_PER_M if transmission_per_m == 1 else (1 - transmission_per_m) / 3
+    air_loss = AIR_LOSS_PER_M if b.transmission_per_m == 1 else (1 - b.transmission_per_m) / 3
     parts = {
-        "noise": scale * errors.netd_K * slope_L * np.sqrt(BILINEAR_VARIANCE * levers.squared),
+        "noise": scale * errors.netd_K * b.slope_L * np.sqrt(BILINEAR_VARIANCE * levers.squared),
         "calibration": scale * np.sqrt((levers.modes**2).sum(1)),
-        "shape": zero if shape_fitted else scale * np.abs(x * levers.loss) * errors.sigma_shape,
+        "shape": zero if b.shape_fitted else scale * np.abs(x * levers.loss) * errors.sigma_shape,
         "normals": scale * np.abs(x) * tilt * normal,
         "registration": np.asarray(errors.gradient_K_per_m) * levers.registration_m,
         "silhouette": scale * np.abs(x) * levers.silhouette,
-        "air": zero if air_K is None else np.abs(T_K - air_K) * air_loss * np.abs(path_m),
+        "air": np.abs(T_K - b.air_K) * air_loss * np.abs(path_m),
     }
     if views_K is not None:
         parts["views"] = np.nan_to_num(views_K)
     common = {
-        "reference": zero + np.nan_to_num(reference_sigma_K) / (epsilon0 if absolute else 1.0),
-        "emissivity0": scale * x / epsilon0 * sigma_epsilon0 if absolute else zero,
-        "reflected": reflected * errors.sigma_reflected_K * slope_reflected / slope_L,
+        "reference": zero + np.nan_to_num(b.reference_sigma_K) / b.divisor,
+        "emissivity0": scale * x / b.epsilon0 * sigma_epsilon0 if b.absolute else zero,
+        "reflected": reflected * errors.sigma_reflected_K * b.slope_reflected / b.slope_L,
     }
     return parts, common
 
@@ -239,8 +272,3 @@ def covariance_modes(covariance: Float, count: int) -> Float:
     values, vectors = np.linalg.eigh(covariance)
     top = np.argsort(values)[::-1][:count]
     return np.asarray(vectors[:, top] * np.sqrt(np.maximum(values[top], 0)))
-
-
-BILINEAR_VARIANCE = 4 / 9  # mean over sub-pixel positions of the noise variance left by bilinear sampling
-AIR_LOSS_PER_M = 0.006  # 1-τ of a metre of room air at 50 % humidity, 7.5-13.5 µm (62 mK at 10 K contrast)
-LINKED_EPSILON0_SIGMA = 0.003  # of ε(0) where it follows the fitted shape of a smooth surface

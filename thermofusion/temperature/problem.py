@@ -1,0 +1,172 @@
+"""The temperature problem: all that is known before it is solved, prepared once, cut by views or vertices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.mesh import edge_gradient
+from ..mapping.observe import Mapped, clear_of_silhouettes
+from ..physics.band import Band
+from ..physics.emissivity import EmissivityModel, model_from_recipe
+from ..physics.equation import leaving_radiance
+from ..recipe import MappingSection, TemperatureSection
+from ..types import Bool, Camera, Float, Observations, Scan, SurfaceMesh
+from .references import ContactReading, ExpectedReading, contact_readings, expected_readings
+from .room import Room, room_of
+from .surroundings import SurroundingsResult, surroundings
+from .uncertainty import ErrorModel
+
+
+@dataclass(frozen=True, eq=False)
+class ThermalProblem:
+    """What the temperature of V vertices is solved from. Radiances in W m-2 sr-1.
+
+    vertices : (V,) their numbers in the mesh. observations : of them, freed of the air path, clear of outlines or the
+    best there is; sorted by (view, vertex). clear : (N,) mask of rows that lie clear of outlines: they calibrate.
+    counts : (N,) mask of rows that the map of all views is made of: a part of the views must not fall back on worse.
+    n_views : of the whole scan, whatever part is left. L_reflected : (V,) that vertices are lit by. around : what they
+    see of the body; None where that is switched off, or vertices are a sample. errors : one-sigma parts of an
+    observation. blackbodies, contacts : what sets the level. vertices_per_patch : vertices that share a normal's error.
+    """
+
+    vertices: NDArray[np.intp]
+    observations: Observations
+    clear: Bool
+    counts: Bool
+    n_views: int
+    lens: Camera
+    band: Band
+    emissivity: EmissivityModel
+    room: Room
+    L_reflected: Float
+    around: SurroundingsResult | None
+    errors: ErrorModel
+    blackbodies: tuple[ExpectedReading, ...]
+    contacts: tuple[ContactReading, ...]
+    vertices_per_patch: float
+    mapping: MappingSection
+    settings: TemperatureSection
+
+    @classmethod
+    def of(
+        cls,
+        scan: Scan,
+        surface: SurfaceMesh,
+        normal_window_m: float,
+        mapped: Mapped,
+        mapping: MappingSection,
+        settings: TemperatureSection,
+    ) -> ThermalProblem:
+        """Of a whole scan, the body at one temperature for a start.
+
+        normal_window_m : over which the surface's normals are averaged. Raises ScanError, RecipeError.
+        """
+        assert scan.thermal is not None
+        camera = scan.thermal.camera
+        band, room = Band(*camera.band_um), room_of(scan.environment, settings)
+        L_room = float(band.radiance(room.reflected_K))
+        rows = remove_air_path(mapped.observations, settings.transmission_per_m, float(band.radiance(room.air_K)))
+        clear, counts = clear_of_silhouettes(rows, len(surface), mapping.silhouette_px)
+        rows, clear = rows.select(counts), clear[counts]
+        straight = rows.cos_angle >= np.float32(np.cos(np.radians(mapping.max_angle_deg)))
+        straight_seen = np.bincount(rows.vertex[straight], minlength=len(surface)) > 0
+        problem = cls(
+            vertices=np.arange(len(surface)),
+            observations=rows,
+            clear=clear,
+            counts=straight | ~straight_seen[rows.vertex],
+            n_views=len(mapped.views),
+            lens=camera.lens,
+            band=band,
+            emissivity=model_from_recipe(settings.emissivity, band),
+            room=room,
+            L_reflected=np.full(len(surface), L_room),
+            around=surroundings(surface) if settings.crosscal.surroundings else None,
+            errors=ErrorModel.of(camera, settings),
+            blackbodies=expected_readings(mapped.blackbodies, scan.references, band, L_room),
+            contacts=contact_readings(scan.references, surface, band, scan.root),
+            vertices_per_patch=vertices_per_patch(surface, normal_window_m),
+            mapping=mapping,
+            settings=settings,
+        )
+        return problem.lit_by(np.full(len(surface), np.median(rows.radiance), np.float32))
+
+    def __len__(self) -> int:
+        return len(self.vertices)
+
+    @property
+    def seen_views(self) -> NDArray[np.intp]:
+        """Views that see the vertices, in order of time."""
+        return np.unique(self.observations.view)
+
+    def lit_by(self, L_skin: NDArray) -> ThermalProblem:
+        """With the body's own radiation in what vertices reflect; L_skin : (V,) its radiance, NaN = unmeasured."""
+        if self.around is None:
+            return self
+        L_room = float(self.band.radiance(self.room.reflected_K))
+        lit = self.around.reflected_radiance(L_room, L_skin, emissivity=self.emissivity.hemispherical)
+        return replace(self, L_reflected=lit)
+
+    def informed(self, surface: SurfaceMesh, T_K: Float) -> ThermalProblem:
+        """With what a first map (V,) K tells: the body's own radiation, and where temperature changes along the skin."""
+        errors = replace(self.errors, gradient_K_per_m=edge_gradient(surface.vertices_m, surface.triangles, T_K))
+        return replace(self.lit_by(self.band.radiance(T_K)), errors=errors)
+
+    def part(self, views: Bool, vertices: Bool | None = None) -> ThermalProblem:
+        """Seen by the views of a mask (n_views,) alone, and, if given, the vertices of a mask (V,) alone."""
+        mine = views[self.observations.view]
+        if vertices is not None:
+            mine &= vertices[self.observations.vertex]
+        return replace(
+            self,
+            observations=self.observations.select(mine),
+            clear=self.clear[mine],
+            counts=self.counts[mine],
+            blackbodies=tuple(b for b in self.blackbodies if views[b.view]),
+        )
+
+    def sample(self, size: int) -> ThermalProblem:
+        """An even sample of some `size` of the vertices that were seen, and those under contact thermometers."""
+        seen = np.unique(self.observations.vertex)
+        touched = np.intersect1d(seen, np.concatenate([c.vertices for c in self.contacts] or [np.zeros(0, np.int32)]))
+        chosen = np.union1d(seen[:: max(1, -(-len(seen) // size))], touched)
+        number = np.full(len(self), -1, np.int32)
+        number[chosen] = np.arange(len(chosen), dtype=np.int32)
+        mine = number[self.observations.vertex] >= 0
+        rows = self.observations.select(mine)
+        contacts = [replace(c, vertices=number[c.vertices][number[c.vertices] >= 0]) for c in self.contacts]
+        gradient = np.broadcast_to(np.asarray(self.errors.gradient_K_per_m), (len(self),))
+        return replace(
+            self,
+            vertices=self.vertices[chosen],
+            observations=replace(rows, vertex=number[rows.vertex]),
+            clear=self.clear[mine],
+            counts=self.counts[mine],
+            L_reflected=self.L_reflected[chosen],
+            around=None,
+            errors=replace(self.errors, gradient_K_per_m=gradient[chosen]),
+            contacts=tuple(c for c in contacts if len(c.vertices)),
+            vertices_per_patch=self.vertices_per_patch * len(chosen) / len(self),
+        )
+
+
+def remove_air_path(observations: Observations, transmission_per_m: float, L_air: float) -> Observations:
+    """Observations (N,) with the air between surface and camera removed: L = (L' - (1-τ) L_air)/τ, τ = τ₁^range.
+
+    L_air : W m-2 sr-1.
+    """
+    if transmission_per_m == 1.0:
+        return observations
+    tau = np.float32(transmission_per_m) ** observations.range_m
+    L = leaving_radiance(observations.radiance, transmission=tau, L_air=L_air)
+    return replace(observations, radiance=L.astype(np.float32))
+
+
+def vertices_per_patch(surface: SurfaceMesh, window_m: float) -> float:
+    """Vertices in a disc of the normals' window: they share their normal, and with it their error."""
+    a, b, c = (surface.vertices_m[surface.triangles[:, k]] for k in range(3))
+    area_m2 = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+    return float(np.pi * (window_m / 2) ** 2 * len(surface) / area_m2)
