@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.camera import pixel_rays
-from ..recipe import Recipe
+from ..recipe import InputSection, SubjectSection
 from ..types import Bool, Camera, Float, Float32, Scan
 from .filter import DepthFrames, read_ahead
 
@@ -47,43 +47,37 @@ class FloorPlane:
 
 
 class SubjectFrames:
-    """Depth frames in which only the subject is left. Same interface as `DepthFrames`.
+    """Depth frames in which only the subject is left.
 
     Attributes
     ----------
-    camera : pinhole camera of the images. floors : {frame: FloorPlane}, filled as frames are loaded.
+    camera : pinhole camera of the images.
     """
 
-    def __init__(self, scan: Scan, recipe: Recipe) -> None:
-        self._frames, self._subject = DepthFrames(scan, recipe.input), recipe.subject
+    def __init__(self, scan: Scan, *, input: InputSection, subject: SubjectSection) -> None:
+        self._frames, self._subject = DepthFrames(scan, input), subject
         self.camera: Camera = self._frames.camera
         rays = pixel_rays(self.camera)
         self._rays: Float32 = (rays / rays[..., 2:]).astype(np.float32)
-        self._static = static_scene(self._frames) if recipe.subject.motion == "subject" else None
-        self.floors: dict[int, FloorPlane] = {}
+        self._static = static_scene(self._frames) if subject.motion == "subject" else None
 
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def load(self, i: int) -> Float32:
-        """Frame i, (H, W) float32 metres, NaN = not the subject."""
+    def load(self, i: int) -> tuple[Float32, FloorPlane | None]:
+        """Frame i: depth (H, W) float32 m, NaN = not the subject; and the floor that was found in it and taken away."""
         depth = self._frames.load(i)
-        if self._subject.floor != "keep":
-            floor = find_floor(depth, self._rays)
-            if floor is not None:
-                self.floors[i] = floor
-                height = (self._rays @ floor.plane[:3].astype(np.float32)) * depth + np.float32(floor.plane[3])
-                depth = np.where(height > TRACKING_CLEARANCE_M * np.minimum(1, depth), depth, np.float32(np.nan))
+        floor = None if self._subject.floor == "keep" else find_floor(depth, self._rays)
+        if floor is not None:
+            height = (self._rays @ floor.plane[:3].astype(np.float32)) * depth + np.float32(floor.plane[3])
+            depth = np.where(height > TRACKING_CLEARANCE_M * np.minimum(1, depth), depth, np.float32(np.nan))
         if self._static is not None:
             room = depth > self._static - static_tolerance(self._static)
             depth = np.where(room, np.float32(np.nan), depth)
         if self._subject.background == "remove":
             depth[behind_subject(depth)] = np.nan
-        return depth
+        return depth, floor
 
-    def read_ahead(self, frames: Sequence[int], *, workers: int = 2) -> Iterator[tuple[int, Float32]]:
-        """(i, frame i) in the order given, a few frames ahead on threads."""
-        return zip(frames, read_ahead(self.load, frames, workers=workers), strict=True)
+    def read_ahead(self, frames: Sequence[int]) -> Iterator[tuple[int, Float32]]:
+        """(i, depth (H, W) m of frame i) in the order given, a few frames ahead on threads."""
+        return ((i, depth) for i, (depth, _) in zip(frames, read_ahead(self.load, frames), strict=True))
 
 
 def find_floor(depth_m: Float32, rays: Float32, *, seed: int = 0) -> FloorPlane | None:
