@@ -36,8 +36,8 @@ def test_the_floor_is_found_where_it_is(down_m, turn_deg):
     assert floor is not None
     T_depth_body = np.linalg.inv(poses[0])
     points = np.array([[x, scenes.FLOOR_Y_M, z] for x in (-0.4, 0.4) for z in (-0.4, 0.4)])
-    assert np.abs(transform_points(T_depth_body, points) @ floor.plane[:3] + floor.plane[3]).max() < 0.012
-    assert floor.plane[3] == pytest.approx(scenes.FLOOR_Y_M - poses[0][1, 3], abs=0.01)  # camera height
+    assert np.abs(transform_points(T_depth_body, points) @ floor[:3] + floor[3]).max() < 0.012
+    assert floor[3] == pytest.approx(scenes.FLOOR_Y_M - poses[0][1, 3], abs=0.01)  # camera height
 
 
 def test_a_body_is_no_floor():
@@ -108,7 +108,7 @@ def test_feet_and_floor_of_a_recording(shared_data):
     for i in range(250, 600, 50):
         depth, floor = frames.load(i)
         assert floor is not None
-        heights.append(floor.plane[3])
+        heights.append(floor[3])
         assert 0.05 < np.isfinite(depth).mean() < 0.3  # the body alone
         assert np.nanmax(depth) < 2.3
     assert np.ptp(heights) < 0.6  # a hand-held camera goes down along the body, not through the floor

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..geometry.camera import project
 from ..geometry.mesh import components, keep_vertices, mesh_normals, vertex_areas
-from ..geometry.plane import find_floor, refine_floor
+from ..geometry.plane import floor_in_surface, refine_floor
 from ..geometry.rigid import invert, transform_points
 from ..recipe import SubjectSection
 from ..types import Float, Float32, Int
@@ -89,7 +89,7 @@ def _planes(
     plane = floor
     for _ in range(MAX_PLANES):
         if plane is None:
-            plane = find_floor(vertices, normals, areas, eyes)
+            plane = floor_in_surface(vertices, normals, areas, eyes)
         if plane is None:
             break
         found.append(plane)

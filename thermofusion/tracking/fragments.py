@@ -62,7 +62,7 @@ def build_fragment(frames: Sequence[TrackingFrame], T: Float, intrinsics: Intrin
         np.array([f.index for f in frames]),
         T_middle_frame,
         DepthMap.of(depth, intrinsics, SAMPLES, intensity),
-        np.array([0.0, -1.0, 0.0]) if floor is None else floor.plane[:3],
+        np.array([0.0, -1.0, 0.0]) if floor is None else floor[:3],
     )
 
 

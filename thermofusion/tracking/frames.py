@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..depth.filter import read_ahead
-from ..depth.subject import FloorPlane, SubjectFrames
+from ..depth.subject import SubjectFrames
 from ..geometry.camera import project
 from ..geometry.rigid import transform_points
 from ..recipe import InputSection, SubjectSection, TrackingSection
 from ..scans.pairing import pair_color
-from ..types import Float32, Int, Scan
+from ..types import Float, Float32, Int, Scan
 from .maps import DepthMap, Intrinsics
 
 WIDTH_PX = 320  # images are brought down to about this width
@@ -34,14 +34,14 @@ class TrackingFrame:
     """A depth frame as tracking uses it: coarse, subject only.
 
     index : position in the depth stream. depth_m : (H, W) float32, NaN = none. map : its points, normals, texture.
-    floor : the floor that was seen in the full frame, or None.
+    floor : (4,) `[n, d]` in the frame's camera, n·p + d = height in m, or None where none was seen.
     """
 
     index: int
     time_s: float
     depth_m: Float32
     map: DepthMap
-    floor: FloorPlane | None
+    floor: Float | None
 
     @property
     def empty(self) -> bool:

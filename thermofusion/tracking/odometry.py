@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..depth.subject import FloorPlane
 from ..geometry.rigid import invert, rotation_angle_deg, se3_exp, se3_log
 from ..progress import Progress
 from ..recipe import TrackingSection
@@ -32,8 +31,8 @@ class Segment:
     """Frames tracked without a break.
 
     frames : (N,) positions in the depth stream. T : (N, 4, 4) in the segment's own frame. fitness, residual_mm : (N,)
-    of the step to each frame, NaN for the first. samples : (N,) points of each frame. floors : (N,) in each frame's
-    camera, None where none was seen. fragments : of these frames.
+    of the step to each frame, NaN for the first. samples : (N,) points of each frame. floors : N planes (4,) in
+    each frame's camera, None where none was seen. fragments : of these frames.
     """
 
     frames: NDArray[np.intp]
@@ -41,7 +40,7 @@ class Segment:
     fitness: Float
     residual_mm: Float
     samples: tuple[DepthMap, ...]
-    floors: tuple[FloorPlane | None, ...]
+    floors: tuple[Float | None, ...]
     fragments: tuple[Fragment, ...]
 
 
@@ -75,7 +74,7 @@ class GrowingSegment:
         self._fitness: list[float] = []
         self._residual: list[float] = []
         self._samples: list[DepthMap] = []
-        self._floors: list[FloorPlane | None] = []
+        self._floors: list[Float | None] = []
         self._fragments: list[Fragment] = []
         self._pending: list[TrackingFrame] = []
         self._velocity = np.zeros(6)  # twist per second

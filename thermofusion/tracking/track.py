@@ -339,7 +339,7 @@ def _floor(placed: list[_Placed], T: Float, n: int) -> Float | None:
     seen = [(i, f) for p in placed for i, f in zip(p.segment.frames, p.segment.floors, strict=True) if f is not None]
     if len(seen) < max(3, MIN_FLOOR_SHARE * n):
         return None
-    planes = np.array([_to_world(f.plane, T[i]) for i, f in seen])
+    planes = np.array([_to_world(f, T[i]) for i, f in seen])
     middle = np.median(planes, axis=0)
     good = (np.abs(planes[:, 3] - middle[3]) < 0.05) & (planes[:, :3] @ middle[:3] > np.cos(np.radians(5)))
     if good.sum() < 0.5 * len(planes):
