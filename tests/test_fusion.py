@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from thermofusion.geometry.camera import pixel_rays
 from thermofusion.geometry.normals import window_normals
 from thermofusion.recipe import load_recipe
 from thermofusion.surface import surface as fusion
-from thermofusion.surface.surface import FusionResult, depth_poses, fuse_surface
+from thermofusion.surface.surface import SurfaceResult, depth_poses, fuse_surface
 from thermofusion.surface.tsdf import Frames, depth_noise, integrate_frames, plan_grid, survey_depth
 from thermofusion.types import Camera, Rig, Scan, Stream, Trajectory
 
@@ -104,7 +105,12 @@ def scan_of(images, camera=CAMERA, **more):
 
 def fuse(images, poses, recipe=None, camera=CAMERA, **more):
     scan = scan_of(images, camera)
-    return fuse_surface(scan, Trajectory(scan.depth.times_s, poses), load_recipe(recipe or RECIPE), **more)
+    return fuse_along(scan, Trajectory(scan.depth.times_s, poses), recipe or RECIPE, **more)
+
+
+def fuse_along(scan, trajectory, recipe, floor_plane=None):
+    tracked, recipe = SimpleNamespace(trajectory=trajectory, floor_plane=floor_plane), load_recipe(recipe)
+    return fuse_surface(scan, tracked, input=recipe.input, subject=recipe.subject, surface=recipe.fusion)
 
 
 def closed(mesh):
@@ -116,7 +122,7 @@ def closed(mesh):
 
 
 @pytest.fixture(scope="module")
-def ball() -> tuple[list, np.ndarray, FusionResult]:
+def ball() -> tuple[list, np.ndarray, SurfaceResult]:
     """A 300 mm ball seen from a ring above and a ring below: all round."""
     poses = np.concatenate([orbit(16, height=0.6), orbit(16, height=-0.6)])
     images = render([sphere((0, 0, 0), 0.15)], poses)
@@ -159,8 +165,9 @@ def test_no_memory_to_begin_with_costs_no_surface(ball) -> None:
     frames: Frames = DepthFrames(scan, recipe.input)
     placed = depth_poses(scan, Trajectory(scan.depth.times_s, poses), 0.5)
     survey = survey_depth(scan, frames, placed)
-    plan = plan_grid(scan, survey, recipe)
-    grid, _ = integrate_frames(survey, frames, placed, replace(plan, blocks=1), recipe, None)
+    sections = {"input": recipe.input, "surface": recipe.fusion}
+    plan = plan_grid(scan, survey, **sections)
+    grid, _ = integrate_frames(survey, frames, placed, replace(plan, blocks=1), **sections)
     V, F = meshing.canonical(*grid.extract(3))
     assert grid.blocks == expected.blocks_used
     F = meshing.close_pinholes(V, F, fusion.PINHOLE_VOXELS * plan.voxel_m)
@@ -286,7 +293,7 @@ def test_bad_input_is_one_clear_sentence(ball, change, words) -> None:
     d, T, t = change(images, poses.copy(), scan.depth.times_s)
     T[:, 3, 3] = 1
     with pytest.raises(ScanError) as e:
-        fuse_surface(scan_of(d), Trajectory(t, T), load_recipe(RECIPE))
+        fuse_along(scan_of(d), Trajectory(t, T), RECIPE)
     assert all(w in str(e.value) for w in words), e.value
 
 
@@ -316,7 +323,7 @@ def test_vertices_take_the_colour_painted_on_them(ball) -> None:
         photos.append(np.where(np.isfinite(t)[..., None], 128 + 100 * n, 255).astype(np.uint8))
     photos[5] = np.full_like(photos[5], 0)
     scan = replace(scan_of(images), rig=Rig(CAMERA, color=LENS, T_color_depth=T_color_depth), color=stream(photos))
-    mesh = fuse_surface(scan, Trajectory(scan.depth.times_s, poses), load_recipe(RECIPE)).mesh
+    mesh = fuse_along(scan, Trajectory(scan.depth.times_s, poses), RECIPE).mesh
     np.testing.assert_array_equal(mesh.vertices_m, plain.mesh.vertices_m)
     expected = 128 + 100 * mesh.vertices_m / np.linalg.norm(mesh.vertices_m, axis=1, keepdims=True)
     off = np.abs(mesh.color_rgb.astype(float) - expected).max(1)
@@ -400,7 +407,7 @@ def test_torso_recording_meets_its_bars(shared_data) -> None:
     folder = shared_data("torso-dev")
     scan = open_scan(folder)
     third = Trajectory(scan.trajectory.times_s[::3], scan.trajectory.T_world_depth[::3])
-    result = fuse_surface(scan, third, load_recipe("torso"))
+    result = fuse_along(scan, third, "torso")
     assert result.frames_used == 60
     truth = np.load(folder / "truth" / "surface.npz")
     surface = o3d.t.geometry.RaycastingScene()

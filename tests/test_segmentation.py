@@ -13,6 +13,11 @@ from thermofusion.geometry.rigid import transform_points
 from thermofusion.recipe import load_recipe
 from thermofusion.scans import open_scan
 
+
+def subject_frames(scan, recipe):
+    return SubjectFrames(scan, input=recipe.input, subject=recipe.subject)
+
+
 RAYS = (pixel_rays(scenes.CAMERA) / pixel_rays(scenes.CAMERA)[..., 2:]).astype(np.float32)
 WALL = scenes.box([-1.5, -1.2, 1.0], [1.5, 1.2, 1.05])
 
@@ -31,8 +36,8 @@ def test_the_floor_is_found_where_it_is(down_m, turn_deg):
     assert floor is not None
     T_depth_body = np.linalg.inv(poses[0])
     points = np.array([[x, scenes.FLOOR_Y_M, z] for x in (-0.4, 0.4) for z in (-0.4, 0.4)])
-    assert np.abs(transform_points(T_depth_body, points) @ floor.plane[:3] + floor.plane[3]).max() < 0.012
-    assert floor.plane[3] == pytest.approx(scenes.FLOOR_Y_M - poses[0][1, 3], abs=0.01)  # camera height
+    assert np.abs(transform_points(T_depth_body, points) @ floor[:3] + floor[3]).max() < 0.012
+    assert floor[3] == pytest.approx(scenes.FLOOR_Y_M - poses[0][1, 3], abs=0.01)  # camera height
 
 
 def test_a_body_is_no_floor():
@@ -62,19 +67,20 @@ def test_a_body_alone_has_nothing_behind():
 def test_subject_frames_leave_the_body():
     poses = scenes.orbit(4, 60, down_m=0.3)
     scan = scenes.walk(poses, room=(scenes.floor(), WALL)).scan()
-    frames = SubjectFrames(scan, load_recipe("full-body"))
+    frames = subject_frames(scan, load_recipe("full-body"))
     for i, body in enumerate(truth_mask(poses)):
-        kept = np.isfinite(frames.load(i))
+        depth, floor = frames.load(i)
+        kept = np.isfinite(depth)
         assert kept[~body].sum() < 0.02 * body.sum()
         assert kept[body].mean() > 0.85  # at this resolution a tenth of the body is outline, which the filter takes
-    assert sorted(frames.floors) == [0, 1, 2, 3]
+        assert floor is not None
 
 
 def test_what_the_recipe_keeps_is_kept():
     poses = scenes.orbit(1, 0, down_m=0.3)
     scan = scenes.walk(poses, room=(scenes.floor(), WALL)).scan()
     recipe = load_recipe("full-body", ["subject.floor=keep", "subject.background=keep", "input.max_grazing_deg=90"])
-    kept = np.isfinite(SubjectFrames(scan, recipe).load(0))
+    kept = np.isfinite(subject_frames(scan, recipe).load(0)[0])
     seen = np.isfinite(scan.depth.load(0))
     assert kept.sum() > 0.97 * seen.sum()  # flying pixels alone are gone
 
@@ -89,7 +95,7 @@ def test_what_stands_still_behind_a_turning_subject_is_known():
     never = ~bodies.any(0)
     assert np.isfinite(room[never]).mean() > 0.95
     np.testing.assert_allclose(np.nanmedian(room[never]), 1.55, atol=0.01)
-    kept = [np.isfinite(SubjectFrames(scan, recipe).load(i)) for i in (0, 13, 26)]
+    kept = [np.isfinite(subject_frames(scan, recipe).load(i)[0]) for i in (0, 13, 26)]
     for mask, body in zip(kept, bodies[[0, 13, 26]], strict=True):
         assert mask[never].mean() < 0.01
         assert mask[body].mean() > 0.75
@@ -97,12 +103,12 @@ def test_what_stands_still_behind_a_turning_subject_is_known():
 
 def test_feet_and_floor_of_a_recording(shared_data):
     scan = open_scan(shared_data("body-dev"))
-    frames = SubjectFrames(scan, load_recipe("full-body"))
+    frames = subject_frames(scan, load_recipe("full-body"))
     heights = []
     for i in range(250, 600, 50):
-        depth = frames.load(i)
-        assert i in frames.floors
-        heights.append(frames.floors[i].plane[3])
+        depth, floor = frames.load(i)
+        assert floor is not None
+        heights.append(floor[3])
         assert 0.05 < np.isfinite(depth).mean() < 0.3  # the body alone
         assert np.nanmax(depth) < 2.3
     assert np.ptp(heights) < 0.6  # a hand-held camera goes down along the body, not through the floor

@@ -13,15 +13,19 @@ from thermofusion.files.tum import read_trajectory
 from thermofusion.geometry.rigid import invert, se3_exp, transform_points
 from thermofusion.recipe import load_recipe
 from thermofusion.scans import open_scan
+from thermofusion.tracking import track as tracking
 from thermofusion.tracking.frames import coarse_depth, local_contrast, stiffness_of
 from thermofusion.tracking.joint import solve_jointly
 from thermofusion.tracking.maps import DepthMap
 from thermofusion.tracking.registration import agreement, register
-from thermofusion.tracking.track import track
 from thermofusion.types import Rig, Stream, Trajectory
 
 RECIPE = load_recipe("torso")
 ATE_MM = 2.0  # of 160 x 120 pixels that measure 7 mm each: a third of a pixel
+
+
+def track(scan, recipe):
+    return tracking.track(scan, input=recipe.input, subject=recipe.subject, tracking=recipe.tracking)
 
 
 @pytest.fixture(scope="module")

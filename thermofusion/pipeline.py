@@ -10,11 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .errors import ScanError
 from .progress import Progress, silent
 from .recipe import Recipe
 from .report.summary import result_report, summary
@@ -26,7 +24,7 @@ from .version import __version__
 
 if TYPE_CHECKING:
     from .report.casts import Cast
-    from .surface.surface import FusionResult
+    from .surface.surface import SurfaceResult
     from .tracking.track import TrackingResult
 
 
@@ -62,7 +60,9 @@ def fuse(
     Raises ScanError (unusable input), RecipeError, ResourceError. What was computed before an error stays in `out`.
     """
     from .rig.align import align_thermal
+    from .surface.surface import fuse_surface
     from .temperature.solve import measure, see, unmeasured
+    from .tracking.track import locate
 
     verify(scan)
     folder = None if out is None else Path(out)
@@ -79,9 +79,10 @@ def fuse(
         return value
 
     # 1. Surface
-    tracking = run("track", lambda p: locate(scan, recipe, p))
+    read: dict[str, Any] = {"input": recipe.input, "subject": recipe.subject}
+    tracking = run("track", lambda p: locate(scan, **read, tracking=recipe.tracking, progress=p))
     trajectory = tracking.trajectory
-    surface = run("surface", lambda p: fuse_subject(scan, tracking, recipe, p))
+    surface = run("surface", lambda p: fuse_surface(scan, tracking, **read, surface=recipe.fusion, progress=p))
     alignment = seen = temperature = casts = None
     if surface is not None and scan.thermal is None:
         temperature = unmeasured(scan, surface.mesh, recipe, _axes(scan, tracking, surface))
@@ -105,31 +106,6 @@ def fuse(
     return result
 
 
-def locate(scan: Scan, recipe: Recipe, progress: Progress) -> TrackingResult:
-    """Where the depth camera was: the recorded trajectory as it is, or tracked (see `tracking`)."""
-    from .tracking.track import recorded, track
-
-    source = recipe.tracking.source
-    if source == "recorded" and scan.trajectory is None:
-        raise ScanError("no trajectory was recorded", place=scan.root, hint="set tracking.source to auto or estimate")
-    if scan.trajectory is not None and source != "estimate" and not recipe.tracking.refine:
-        return recorded(scan)
-    if source == "estimate":
-        scan = replace(scan, trajectory=None)
-    return track(scan, recipe, progress=progress)
-
-
-def fuse_subject(scan: Scan, tracking: TrackingResult, recipe: Recipe, progress: Progress) -> FusionResult:
-    """The subject's surface (see `fusion`). Before a standing camera the room is masked out as in tracking."""
-    from .depth.subject import SubjectFrames
-    from .surface.surface import fuse_surface
-
-    frames = SubjectFrames(scan, recipe) if recipe.subject.motion == "subject" else None
-    return fuse_surface(
-        scan, tracking.trajectory, recipe, progress=progress, floor_plane=tracking.floor_plane, frames=frames
-    )
-
-
 def plan(scan: Scan, recipe: Recipe, out: Path, *, redo_from: str | None = None) -> list[StagePlan]:
     """What `fuse` would compute or reuse, and why; nothing is computed."""
     stages = _stages(scan, out, redo_from)
@@ -146,7 +122,7 @@ def _casting(surface: SurfaceMesh, axes: dict[str, str]) -> Future[list[Cast]]:
     return casts
 
 
-def _axes(scan: Scan, tracking: TrackingResult, surface: FusionResult) -> dict[str, str]:
+def _axes(scan: Scan, tracking: TrackingResult, surface: SurfaceResult) -> dict[str, str]:
     from .export import view_axes
 
     floor = surface.floor_plane if surface.floor_plane is not None else tracking.floor_plane

@@ -38,7 +38,8 @@ def main() -> None:
     recipe = load_recipe(o.recipe, o.overrides)
 
     wall, cpu = time.perf_counter(), time.process_time()
-    result = track(scan, recipe)
+    sections = {name: getattr(recipe, name) for name in ("input", "subject", "tracking")}
+    result = track(scan, **sections)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     n = len(scan.depth)
     print(f"tracked      {int(result.tracked.sum())} of {n} frames, lost: {list(result.lost) or 'none'}")
@@ -52,7 +53,7 @@ def main() -> None:
     for message in result.messages:
         print(f"message      {message}")
     if o.repeat:
-        again = track(scan, recipe).trajectory.T_world_depth
+        again = track(scan, **sections).trajectory.T_world_depth
         print(f"repeat       largest difference {np.abs(again - result.trajectory.T_world_depth).max():.1e}")
 
 

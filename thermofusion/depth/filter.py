@@ -22,6 +22,7 @@ from ..types import Bool, Camera, Float32, Scan
 MIN_NEIGHBOURS = 3  # of 8: what the corner of a surface still has, and a one-pixel veil between two surfaces has not
 CELL_PX = 4  # slopes are taken between means over squares of this size: single pixels carry only noise
 MIN_CELL_SHARE = 0.25  # of a cell's pixels that must hold depth
+READERS = 2  # threads that decode frames ahead: what keeps up with one that processes them
 
 
 def filter_depth(depth_m: Float32, camera: Camera, section: InputSection) -> Float32:
@@ -168,19 +169,19 @@ class DepthFrames:
         """Frame i: (H, W) float32 metres, NaN = none. Raises ScanError naming the file if it cannot be read."""
         return filter_depth(self._undistort(self._stream.load(i)), self.camera, self._section)
 
-    def read_ahead(self, frames: Sequence[int], *, workers: int = 2) -> Iterator[tuple[int, Float32]]:
-        """(i, frame i) in the order given, a few frames decoded ahead on threads."""
-        return zip(frames, read_ahead(self.load, frames, workers=workers), strict=True)
+    def read_ahead(self, frames: Sequence[int]) -> Iterator[tuple[int, Float32]]:
+        """(i, depth (H, W) m of frame i) in the order given, a few frames decoded ahead on threads."""
+        return zip(frames, read_ahead(self.load, frames), strict=True)
 
 
 T = TypeVar("T")
 
 
-def read_ahead(load: Callable[[int], T], indices: Iterable[int], *, workers: int = 2) -> Iterator[T]:
+def read_ahead(load: Callable[[int], T], indices: Iterable[int]) -> Iterator[T]:
     """load(i) for each index, in order, a few ahead on threads; never more in memory than that."""
-    with ThreadPoolExecutor(workers) as pool:
+    with ThreadPoolExecutor(READERS) as pool:
         todo = iter(indices)
-        pending = deque(pool.submit(load, i) for i in islice(todo, 2 * workers))
+        pending = deque(pool.submit(load, i) for i in islice(todo, 2 * READERS))
         while pending:
             result = pending.popleft()
             pending.extend(pool.submit(load, i) for i in islice(todo, 1))

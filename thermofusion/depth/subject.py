@@ -7,25 +7,18 @@ while the camera walks (820 mm adrift on a whole-body scan, 4 mm without them). 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.camera import pixel_rays
-from ..recipe import Recipe
+from ..geometry.plane import floor_in_view
+from ..recipe import InputSection, SubjectSection
 from ..types import Bool, Camera, Float, Float32, Scan
 from .filter import DepthFrames, read_ahead
 
 GRID = 80  # planes are looked for on about this many pixels of a row, and as densely along columns
-HYPOTHESES = 200
-MAX_TILT_DEG = 45.0  # of the floor's normal against the camera's up: how far a walking person pitches a camera
-FLOOR_TOLERANCE_M = 0.012  # at 1 m, grows with range² beyond and shrinks with range before
-MIN_FLOOR_SHARE = 0.04  # of the valid pixels
-MAX_BELOW_SHARE = 0.02  # nothing lies below a floor
-MIN_EXTENT_M = 0.11  # rms extent of the floor's narrower direction, at 1 m and beyond: less is a lap or a shoulder
-MIN_HEIGHT = 0.15  # of the camera above the floor, as a share of the floor's distance: nobody films along a floor
 TRACKING_CLEARANCE_M = 0.03  # at 1 m and beyond: tracking is better off without what is this near to the floor
 JUMP_AT_1M = 0.05  # depth step between neighbours (times range) that separates two things
 BEHIND_M = 0.30  # at 1 m and beyond: clear air between subject and background
@@ -38,96 +31,48 @@ ALWAYS_SHARE, ALWAYS_AREA = 0.8, 0.2  # a piece of room: a fifth of its pixels s
 STATIC_SHARE = 0.3  # of frames in which a pixel must see the room at its far end
 
 
-@dataclass(frozen=True, eq=False)
-class FloorPlane:
-    """`n·p + d` is the height above the floor of a point of the depth camera's frame. share : of valid pixels on it."""
-
-    plane: Float
-    share: float
-
-
 class SubjectFrames:
-    """Depth frames in which only the subject is left. Same interface as `DepthFrames`.
+    """Depth frames in which only the subject is left.
 
     Attributes
     ----------
-    camera : pinhole camera of the images. floors : {frame: FloorPlane}, filled as frames are loaded.
+    camera : pinhole camera of the images.
     """
 
-    def __init__(self, scan: Scan, recipe: Recipe) -> None:
-        self._frames, self._subject = DepthFrames(scan, recipe.input), recipe.subject
+    def __init__(self, scan: Scan, *, input: InputSection, subject: SubjectSection) -> None:
+        self._frames, self._subject = DepthFrames(scan, input), subject
         self.camera: Camera = self._frames.camera
         rays = pixel_rays(self.camera)
         self._rays: Float32 = (rays / rays[..., 2:]).astype(np.float32)
-        self._static = static_scene(self._frames) if recipe.subject.motion == "subject" else None
-        self.floors: dict[int, FloorPlane] = {}
+        self._static = static_scene(self._frames) if subject.motion == "subject" else None
 
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def load(self, i: int) -> Float32:
-        """Frame i, (H, W) float32 metres, NaN = not the subject."""
+    def load(self, i: int) -> tuple[Float32, Float | None]:
+        """Frame i: depth (H, W) float32 m, NaN = not the subject; and the floor (4,) found in it and taken away."""
         depth = self._frames.load(i)
-        if self._subject.floor != "keep":
-            floor = find_floor(depth, self._rays)
-            if floor is not None:
-                self.floors[i] = floor
-                height = (self._rays @ floor.plane[:3].astype(np.float32)) * depth + np.float32(floor.plane[3])
-                depth = np.where(height > TRACKING_CLEARANCE_M * np.minimum(1, depth), depth, np.float32(np.nan))
+        floor = None if self._subject.floor == "keep" else find_floor(depth, self._rays)
+        if floor is not None:
+            height = (self._rays @ floor[:3].astype(np.float32)) * depth + np.float32(floor[3])
+            depth = np.where(height > TRACKING_CLEARANCE_M * np.minimum(1, depth), depth, np.float32(np.nan))
         if self._static is not None:
             room = depth > self._static - static_tolerance(self._static)
             depth = np.where(room, np.float32(np.nan), depth)
         if self._subject.background == "remove":
             depth[behind_subject(depth)] = np.nan
-        return depth
+        return depth, floor
 
-    def read_ahead(self, frames: Sequence[int], *, workers: int = 2) -> Iterator[tuple[int, Float32]]:
-        """(i, frame i) in the order given, a few frames ahead on threads."""
-        return zip(frames, read_ahead(self.load, frames, workers=workers), strict=True)
+    def read_ahead(self, frames: Sequence[int]) -> Iterator[tuple[int, Float32]]:
+        """(i, depth (H, W) m of frame i) in the order given, a few frames ahead on threads."""
+        return ((i, depth) for i, (depth, _) in zip(frames, read_ahead(self.load, frames), strict=True))
 
 
-def find_floor(depth_m: Float32, rays: Float32, *, seed: int = 0) -> FloorPlane | None:
-    """The floor in a depth image: the lowest large plane, roughly level to the camera, with nothing below it.
-
-    rays : (H, W, 3) directions with z = 1. RANSAC over a grid of pixels with a fixed seed, then least squares.
-    None where there is no such plane.
+def find_floor(depth_m: Float32, rays: Float32) -> Float | None:
+    """The floor (4,) `[n, d]` in a depth image (H, W) m, or None: n·p + d is the height in m of a point of the camera's
+    frame above it. rays : (H, W, 3) directions with z = 1. Looked for on a grid of pixels (see `floor_in_view`).
     """
     step = max(1, round(depth_m.shape[1] / GRID))
     z = depth_m[::step, ::step].ravel()
     valid = np.isfinite(z)
-    if valid.sum() < 200:
-        return None
-    p = rays[::step, ::step].reshape(-1, 3)[valid] * z[valid, None]
-    a, b, c = p[np.random.default_rng(seed).integers(0, len(p), (3, HYPOTHESES))]
-    n = np.cross(b - a, c - a)
-    length = np.linalg.norm(n, axis=1)
-    n *= np.where(n[:, 1] > 0, -1, 1)[:, None]  # up is -y
-    level = (length > 1e-6) & (-n[:, 1] > np.cos(np.radians(MAX_TILT_DEG)) * length)
-    if not level.any():
-        return None
-    n, a = n[level] / length[level, None], a[level]
-    tolerance = np.float32(FLOOR_TOLERANCE_M) * np.maximum(p[:, 2], p[:, 2] ** 2)
-    height = p @ n.T - np.einsum("ij,ij->i", n, a)
-    on = (np.abs(height) < tolerance[:, None]).sum(0)
-    below = (height < -2 * tolerance[:, None]).sum(0)
-    best = int(np.argmax(on - 5 * below))
-    if on[best] < MIN_FLOOR_SHARE * len(p) or below[best] > MAX_BELOW_SHARE * len(p):
-        return None
-    plane, extent = np.append(n[best], -(n[best] @ a[best])).astype(np.float64), 0.0
-    inliers = np.zeros(len(p), bool)
-    for _ in range(3):
-        inliers = np.abs(p @ plane[:3] + plane[3]) < tolerance
-        if inliers.sum() < 50:
-            return None
-        centre = p[inliers].mean(0)
-        _, s, axes = np.linalg.svd(p[inliers] - centre, full_matrices=False)
-        normal = axes[2] * (-1 if axes[2, 1] > 0 else 1)
-        plane, extent = np.append(normal, -(normal @ centre)).astype(np.float64), float(s[1] / np.sqrt(inliers.sum()))
-    distance = float(np.median(p[inliers, 2]))
-    if plane[3] < MIN_HEIGHT * distance:
-        return None
-    smallest = MIN_EXTENT_M * min(1.0, distance)
-    return FloorPlane(plane, float(inliers.mean())) if extent > smallest else None
+    return floor_in_view(rays[::step, ::step].reshape(-1, 3)[valid] * z[valid, None])
 
 
 def behind_subject(depth_m: Float32) -> Bool:

@@ -1,4 +1,4 @@
-"""Triangle meshes as plain arrays: order, pieces, floor, smoothing, normals. NumPy and SciPy, no Open3D, no files."""
+"""Triangle meshes as plain arrays: order, edges, areas, pieces, holes, smoothing, normals. NumPy and SciPy alone."""
 
 from __future__ import annotations
 
@@ -61,6 +61,17 @@ def components(triangles: Int, count: int) -> Int:
     along = (triangles[:, :2].ravel(), triangles[:, 1:].ravel())  # two sides of a triangle connect its three corners
     graph = csr_matrix((np.ones(len(along[0]), np.int8), along), shape=(count, count))
     return connected_components(graph, directed=False)[1].astype(np.int32)
+
+
+def undirected_edges(triangles: Int) -> tuple[Int, Bool]:
+    """Undirected edges (E, 2) of triangles (F, 3), vertex indices, and a mask (E,): on an open border.
+
+    An edge of one triangle only is an open border's.
+    """
+    pairs = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
+    code = pairs[:, 0].astype(np.int64) << 32 | pairs[:, 1].astype(np.int64)
+    unique, count = np.unique(code, return_counts=True)
+    return np.stack([unique >> 32, unique & 0xFFFFFFFF], axis=1).astype(np.int32), count == 1
 
 
 def keep_vertices(vertices: Float32, triangles: Int, keep: Bool) -> tuple[Float32, Int]:

@@ -1,21 +1,15 @@
-"""Depth frames with poses into the subject's surface: fuse, clean, normals, colour.
-
-The TSDF itself is `tsdf`, used only here.
-"""
+"""Surface normals averaged over a window, by plane fits."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from ..types import Float32, Int
-from . import mesh as meshing
+from .mesh import mesh_normals
 
 PLANE_PER_WINDOW = 0.4  # radius of a plane fit, of the normal window: see window_normals
 MAX_NEIGHBOURS = 100  # in a plane fit
 PLANE_AGREES_COS = 0.8  # 37°: a plane fit farther from the mesh's own normal caught another part of the body
-
-
-# ---------------------------------------------------------------- normals
 
 
 def window_normals(vertices: Float32, triangles: Int, window_m: float) -> Float32:
@@ -28,7 +22,7 @@ def window_normals(vertices: Float32, triangles: Int, window_m: float) -> Float3
     """
     from ._open3d import o3d
 
-    own = meshing.mesh_normals(vertices, triangles)
+    own = mesh_normals(vertices, triangles)
     cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(np.ascontiguousarray(vertices)))
     cloud.estimate_normals(max_nn=MAX_NEIGHBOURS, radius=PLANE_PER_WINDOW * window_m)
     n: Float32 = cloud.point.normals.numpy()

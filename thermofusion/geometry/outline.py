@@ -1,9 +1,8 @@
-"""Where the model's outline should stand in a thermal image, and where the image shows it.
+"""Where the model's outline should stand in a thermal image.
 
 Only outlines against the empty background are used: rays of a coarse pixel grid find where the surface ends, bisection
 finds the end to a fraction of a pixel. A true occluding contour is seen edge-on, and away from the mesh's open borders;
-the rim of a hole or of the cut at the waist is dropped (the body goes on where the mesh does not). The image's edge is
-the steepest step along the outline's normal.
+the rim of a hole or of the cut at the waist is dropped (the body goes on where the mesh does not).
 """
 
 from __future__ import annotations
@@ -15,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from ..types import Camera, Float, Float32, SurfaceMesh
 from .camera import pixel_rays, project
+from .mesh import undirected_edges
 from .rays import RayScene, rays_from
 from .rigid import transform_points
 
@@ -89,11 +89,8 @@ class OutlineCaster:
 
 def _border_tree(mesh: SurfaceMesh) -> cKDTree | None:
     """Search tree of the vertices on open borders: on edges with one triangle only. None for a closed mesh."""
-    t = mesh.triangles.astype(np.int64)
-    a, b = np.concatenate([t[:, 0], t[:, 1], t[:, 2]]), np.concatenate([t[:, 1], t[:, 2], t[:, 0]])
-    code, count = np.unique(np.minimum(a, b) << 32 | np.maximum(a, b), return_counts=True)
-    single = code[count == 1]
-    ends = np.unique(np.concatenate([single >> 32, single & 0xFFFFFFFF]))
+    edges, border = undirected_edges(mesh.triangles)
+    ends = np.unique(edges[border])
     return cKDTree(mesh.vertices_m[ends]) if len(ends) else None
 
 

@@ -16,7 +16,7 @@ from ..version import __version__
 if TYPE_CHECKING:
     from ..pipeline import Result
     from ..rig.align import AlignmentResult
-    from ..surface.surface import FusionResult
+    from ..surface.surface import SurfaceResult
     from ..temperature.solve import Seen, Temperature
     from ..tracking.track import TrackingResult
 
@@ -27,7 +27,7 @@ def result_report(
     scan: Scan,
     recipe: Recipe,
     tracking: TrackingResult,
-    surface: FusionResult | None,
+    surface: SurfaceResult | None,
     alignment: AlignmentResult | None,
     seen: Seen | None,
     temperature: Temperature | None,
@@ -130,7 +130,7 @@ def _tracking(t: TrackingResult) -> dict[str, Any]:
     }
 
 
-def _surface(s: FusionResult) -> dict[str, Any]:
+def _surface(s: SurfaceResult) -> dict[str, Any]:
     extent = np.ptp(s.mesh.vertices_m, axis=0)
     return {
         "vertices": len(s.mesh),

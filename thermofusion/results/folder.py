@@ -17,7 +17,7 @@ from .artifacts import load_artifact, save_artifact
 if TYPE_CHECKING:
     from ..report.casts import Cast
     from ..rig.align import AlignmentResult
-    from ..surface.surface import FusionResult
+    from ..surface.surface import SurfaceResult
     from ..temperature.solve import Seen, Temperature
     from ..tracking.track import TrackingResult
 
@@ -29,7 +29,7 @@ class Result:
     report: dict[str, Any]
     trajectory: Trajectory
     tracking: TrackingResult | None = None
-    surface: FusionResult | None = None
+    surface: SurfaceResult | None = None
     alignment: AlignmentResult | None = None
     seen: Seen | None = None
     temperature: Temperature | None = None

@@ -1,7 +1,4 @@
-"""Depth frames with poses into the subject's surface: fuse, clean, normals, colour.
-
-The TSDF itself is `tsdf`, used only here.
-"""
+"""The subject's surface alone: floor, walls, what stands beside, and specks are taken away."""
 
 from __future__ import annotations
 
@@ -9,16 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..geometry import mesh as meshing
 from ..geometry.camera import project
-from ..geometry.plane import find_floor, refine_floor
+from ..geometry.mesh import components, keep_vertices, mesh_normals, vertex_areas
+from ..geometry.plane import floor_in_surface, refine_floor
 from ..geometry.rigid import invert, transform_points
-from ..recipe import Recipe
+from ..recipe import SubjectSection
 from ..types import Float, Float32, Int
-from .tsdf import (
-    GridPlan,
-    Survey,
-)
+from .tsdf import GridPlan, Survey
 
 SEEN_TRUNCATIONS = 2.0  # a vertex is on a frame's surface if nearer to it than this, in truncations
 VOTE_SHARE = 0.05  # of what a frame sees; less is a hand in front or a chair's leg
@@ -34,14 +28,32 @@ class RemovedPart:
     pieces: int
 
 
-# ---------------------------------------------------------------- cleaning
+@dataclass(frozen=True, eq=False)
+class Cleaned:
+    """What is left: vertices_m (V, 3), triangles (F, 3). floor_plane : (4,) `[n, d]` of the floor found, or None."""
+
+    vertices_m: Float32
+    triangles: Int
+    floor_plane: Float | None
+    removed: tuple[RemovedPart, ...]
+    messages: tuple[str, ...]
 
 
-def _clean(
-    vertices: Float32, triangles: Int, survey: Survey, plan: GridPlan, recipe: Recipe, floor_plane: Float | None
-) -> tuple[Float32, Int, Float | None, tuple[RemovedPart, ...], tuple[str, ...]]:
-    """The subject's surface alone: without floor, background and specks."""
-    subject, removed, messages = recipe.subject, [], []
+def subject_only(
+    vertices: Float32,
+    triangles: Int,
+    survey: Survey,
+    plan: GridPlan,
+    *,
+    subject: SubjectSection,
+    floor_plane: Float | None,
+) -> Cleaned:
+    """The surface without floor, background and specks.
+
+    vertices : (V, 3) m. triangles : (F, 3). floor_plane : (4,) `[n, d]` of an earlier stage [m], refined on the
+    surface; None: looked for, as the recipe says.
+    """
+    removed, messages = [], []
     floor: Float | None = None
     walls: list[Float] = []
     if subject.floor != "keep":
@@ -52,10 +64,10 @@ def _clean(
     planes += [("wall", w) for w in walls] if subject.background == "remove" else []
     for reason, plane in planes:
         stays = _height(plane, vertices) >= subject.floor_clearance_mm / 1e3
-        removed.append(RemovedPart(reason, 1e4 * float(meshing.vertex_areas(vertices, triangles)[~stays].sum()), 1))
-        vertices, triangles = meshing.keep_vertices(vertices, triangles, stays)
-    vertices, triangles, others = _pieces(vertices, triangles, survey, plan, recipe)
-    return vertices, triangles, floor, (*removed, *others), tuple(messages)
+        removed.append(RemovedPart(reason, 1e4 * float(vertex_areas(vertices, triangles)[~stays].sum()), 1))
+        vertices, triangles = keep_vertices(vertices, triangles, stays)
+    vertices, triangles, others = _pieces(vertices, triangles, survey, plan, subject)
+    return Cleaned(vertices, triangles, floor, (*removed, *others), tuple(messages))
 
 
 def _height(plane: Float, points: Float32) -> Float32:
@@ -69,7 +81,7 @@ def _planes(
 
     Of several planes the floor is the one that faces up as the cameras were held.
     """
-    areas, normals = meshing.vertex_areas(vertices, triangles), meshing.mesh_normals(vertices, triangles)
+    areas, normals = vertex_areas(vertices, triangles), mesh_normals(vertices, triangles)
     eyes, up = survey.T_world_depth[:, :3, 3], -survey.T_world_depth[:, :3, 1].mean(0)
     found: list[Float] = []
     if floor is not None:
@@ -77,7 +89,7 @@ def _planes(
     plane = floor
     for _ in range(MAX_PLANES):
         if plane is None:
-            plane = find_floor(vertices, normals, areas, eyes)
+            plane = floor_in_surface(vertices, normals, areas, eyes)
         if plane is None:
             break
         found.append(plane)
@@ -89,18 +101,17 @@ def _planes(
 
 
 def _pieces(
-    vertices: Float32, triangles: Int, survey: Survey, plan: GridPlan, recipe: Recipe
+    vertices: Float32, triangles: Int, survey: Survey, plan: GridPlan, subject: SubjectSection
 ) -> tuple[Float32, Int, tuple[RemovedPart, ...]]:
     """The connected pieces that are the subject.
 
     The subject is what the camera walked round: in most frames the nearest thing of some size. A wall may be larger and
     fill more of the images, but stands behind. Where the background is kept, only specks go.
     """
-    subject = recipe.subject
     if len(triangles) == 0:
         return vertices, triangles, ()
-    areas = meshing.vertex_areas(vertices, triangles)
-    label = meshing.components(triangles, len(vertices))
+    areas = vertex_areas(vertices, triangles)
+    label = components(triangles, len(vertices))
     area_cm2 = 1e4 * np.bincount(label, areas)
     large = area_cm2 >= subject.min_component_cm2
     keep = large.copy()
@@ -112,7 +123,7 @@ def _pieces(
     for reason, gone in (("beside the subject", large & ~keep), ("specks", ~large)):
         if gone.any():
             removed.append(RemovedPart(reason, float(area_cm2[gone].sum()), int(gone.sum())))
-    vertices, triangles = meshing.keep_vertices(vertices, triangles, keep[label])
+    vertices, triangles = keep_vertices(vertices, triangles, keep[label])
     return vertices, triangles, tuple(removed)
 
 

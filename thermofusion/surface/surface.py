@@ -1,32 +1,24 @@
-"""Depth frames with poses into the subject's surface: fuse, clean, normals, colour.
-
-The TSDF itself is `tsdf`, used only here.
-"""
+"""Depth frames with poses into the subject's surface: fuse, clean, normals, colour."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from ..depth.filter import DepthFrames
+from ..depth.subject import SubjectFrames
 from ..errors import ScanError
-from ..geometry import mesh as meshing
+from ..geometry.mesh import canonical, close_pinholes, smooth_positions
 from ..geometry.normals import window_normals
 from ..geometry.rigid import interpolate_trajectory
-from ..recipe import Recipe
-from ..types import Float, Scan, SurfaceMesh, Trajectory
-from .clean import RemovedPart, _clean
+from ..progress import Progress, silent
+from ..recipe import SurfaceSection, InputSection, SubjectSection
+from ..types import Float, Float32, Int, Scan, SurfaceMesh, Trajectory
+from .clean import RemovedPart, subject_only
 from .color import color_vertices
-from .tsdf import (
-    BYTES_PER_BLOCK,
-    FramePoses,
-    Frames,
-    Progress,
-    integrate_frames,
-    plan_grid,
-    survey_depth,
-)
+from .tsdf import BYTES_PER_BLOCK, FramePoses, Frames, VoxelGrid, integrate_frames, plan_grid, survey_depth
 
 SAME_TIME_S = 1e-3  # a pose this near in time is the frame's own
 PINHOLE_VOXELS = 14.0  # round a hole of two voxels' radius
@@ -39,7 +31,7 @@ class SurfaceResult:
 
     mesh : in world metres. voxel_m, truncation_m : of the grid. max_range_m : depth beyond it was not used.
     noise_m_at_1m : depth noise estimated from the data, grows with range². blocks_estimated, blocks_used, memory_gib :
-    of the grid. floor_plane : (4,) `[n, d]`, n·p + d = height above the floor in metres; None = none found.
+    of the grid. normal_window_m : diameter over which normals were averaged. floor_plane : (4,) `[n, d]`, n·p + d = height above the floor in metres; None = none found.
     """
 
     mesh: SurfaceMesh
@@ -51,58 +43,60 @@ class SurfaceResult:
     blocks_used: int
     memory_gib: float
     frames_used: int
+    normal_window_m: float
     floor_plane: Float | None
     removed: tuple[RemovedPart, ...]
     messages: tuple[str, ...]
 
 
+class Tracked(Protocol):
+    """What tracking found out (see `tracking.track.TrackingResult`)."""
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Poses of the depth camera."""
+
+    @property
+    def floor_plane(self) -> Float | None:
+        """(4,) `[n, d]` in the world, n·p + d = height in m; None = none was seen."""
+
+
 def fuse_surface(
     scan: Scan,
-    trajectory: Trajectory,
-    recipe: Recipe,
+    tracked: Tracked,
     *,
-    progress: Progress | None = None,
-    floor_plane: Float | None = None,
-    frames: Frames | None = None,
+    input: InputSection,
+    subject: SubjectSection,
+    surface: SurfaceSection,
+    progress: Progress = silent,
 ) -> SurfaceResult:
     """Fuse a scan's depth frames into the surface of its subject.
 
-    Parameters
-    ----------
-    progress : called with ("surface", frames done, frames in all).
-    floor_plane : (4,) of an earlier stage, refined on the surface; None: looked for, as the recipe says.
-    frames : depth images, if not simply the scan's (e.g. with the background masked out).
+    A floor that tracking saw is refined on the surface, else one is looked for, as the recipe says. Before a standing
+    camera the room is masked out as in tracking. progress : called with ("surface", frames done, frames in all).
 
     Raises ScanError if no frame has a pose or no surface results, ResourceError if the grid cannot fit into memory.
     """
-    frames = frames if frames is not None else DepthFrames(scan, recipe.input)
-    poses = depth_poses(scan, trajectory, recipe.input.max_pose_gap_ms / 1e3)
+    turning = subject.motion == "subject"
+    frames: Frames = SubjectFrames(scan, input=input, subject=subject) if turning else DepthFrames(scan, input)
+    max_gap_s = input.max_pose_gap_ms / 1e3
+    poses = depth_poses(scan, tracked.trajectory, max_gap_s)
     survey = survey_depth(scan, frames, poses)
-    plan = plan_grid(scan, survey, recipe)
-    grid, plan = integrate_frames(survey, frames, poses, plan, recipe, progress)
-    # A handful of views cannot see everything three times: a third of them is enough.
-    min_weight = min(recipe.fusion.min_weight, max(1, len(poses.frame) // 3))
-    vertices, triangles = grid.extract(min_weight)
-    if len(triangles) == 0:
+    plan = plan_grid(scan, survey, input=input, surface=surface)
+    grid, plan = integrate_frames(survey, frames, poses, plan, input=input, surface=surface, progress=progress)
+    found = _extracted(grid, len(poses.frame), surface.min_weight, scan)
+    clean = subject_only(*found, survey, plan, subject=subject, floor_plane=tracked.floor_plane)
+    if len(clean.triangles) == 0:
+        gone = ", ".join(f"{r.area_cm2:.0f} cm² {r.reason}" for r in clean.removed)
         raise ScanError(
-            f"{len(poses.frame)} depth frames made no surface: nothing was seen {min_weight:g} times",
-            place=scan.root,
-            hint="the trajectory must be T_world_depth in metres; `thermofusion check` shows the streams",
-        )
-    vertices, triangles = meshing.canonical(vertices, triangles)
-    vertices, triangles, plane, removed, notes = _clean(vertices, triangles, survey, plan, recipe, floor_plane)
-    if len(triangles) == 0:
-        raise ScanError(
-            "no surface is left after cleaning: " + ", ".join(f"{r.area_cm2:.0f} cm² {r.reason}" for r in removed),
+            f"no surface is left after cleaning: {gone}",
             place=scan.root,
             hint="set subject.background = keep, or a smaller subject.min_component_cm2",
         )
-    triangles = meshing.close_pinholes(vertices, triangles, PINHOLE_VOXELS * plan.voxel_m)
-    vertices = meshing.smooth_positions(vertices, triangles, recipe.fusion.smooth_iterations)
-    normals = window_normals(vertices, triangles, recipe.fusion.normal_window_mm / 1e3)
-    color = None
-    if recipe.fusion.color and scan.color is not None:
-        color = color_vertices(scan, trajectory, vertices, normals, recipe.input.max_pose_gap_ms / 1e3)
+    triangles = close_pinholes(clean.vertices_m, clean.triangles, PINHOLE_VOXELS * plan.voxel_m)
+    vertices = smooth_positions(clean.vertices_m, triangles, surface.smooth_iterations)
+    normals = window_normals(vertices, triangles, surface.normal_window_mm / 1e3)
+    color = color_vertices(scan, tracked.trajectory, vertices, normals, max_gap_s) if surface.color else None
     return SurfaceResult(
         mesh=SurfaceMesh(vertices, triangles, normals, color),
         voxel_m=plan.voxel_m,
@@ -113,10 +107,24 @@ def fuse_surface(
         blocks_used=grid.blocks,
         memory_gib=grid.blocks * BYTES_PER_BLOCK / 2**30,
         frames_used=len(poses.frame),
-        floor_plane=plane,
-        removed=removed,
-        messages=(*plan.messages, *notes),
+        normal_window_m=surface.normal_window_mm / 1e3,
+        floor_plane=clean.floor_plane,
+        removed=clean.removed,
+        messages=(*plan.messages, *clean.messages),
     )
+
+
+def _extracted(grid: VoxelGrid, frames: int, min_weight: float, scan: Scan) -> tuple[Float32, Int]:
+    """Vertices (V, 3) m and triangles (F, 3) of what enough of the frames saw, in an order of their own."""
+    min_weight = min(min_weight, max(1, frames // 3))  # a handful of views cannot see everything three times
+    vertices, triangles = grid.extract(min_weight)
+    if len(triangles) == 0:
+        raise ScanError(
+            f"{frames} depth frames made no surface: nothing was seen {min_weight:g} times",
+            place=scan.root,
+            hint="the trajectory must be T_world_depth in metres; `thermofusion check` shows the streams",
+        )
+    return canonical(vertices, triangles)
 
 
 # ---------------------------------------------------------------- poses

@@ -6,6 +6,7 @@ memory is known and bounded before it is taken; the grid still grows if the samp
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -15,8 +16,8 @@ from numpy.typing import NDArray
 
 from ..errors import ResourceError, ScanError
 from ..geometry.rigid import invert
-from ..progress import Progress
-from ..recipe import Recipe
+from ..progress import Progress, silent
+from ..recipe import SurfaceSection, InputSection
 from ..robust import SIGMA_PER_MAD
 from ..types import Camera, Float, Float32, Scan
 
@@ -42,9 +43,7 @@ class Frames(Protocol):
 
     camera: Camera
 
-    def load(self, i: int) -> Float32: ...
-
-    def read_ahead(self, frames: Any, *, workers: int = 2) -> Any: ...
+    def read_ahead(self, frames: Sequence[int]) -> Iterator[tuple[int, Float32]]: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,37 +116,37 @@ def depth_noise(images: tuple[Float32, ...] | list[Float32]) -> float:
     return float(np.clip(SIGMA_PER_MAD * np.median(np.abs(values)) / np.sqrt(20), *NOISE_BOUNDS))
 
 
-def plan_grid(scan: Scan, survey: Survey, recipe: Recipe) -> GridPlan:
+def plan_grid(scan: Scan, survey: Survey, *, input: InputSection, surface: SurfaceSection) -> GridPlan:
     """Voxel, truncation and blocks within the memory allowed: the voxel grows until it fits."""
-    wanted = voxel = _voxel(scan, survey, recipe)
-    max_blocks = int(recipe.fusion.max_memory_gib * 2**30 / BYTES_PER_BLOCK)
+    wanted = voxel = _voxel(scan, survey, surface)
+    max_blocks = int(surface.max_memory_gib * 2**30 / BYTES_PER_BLOCK)
     while True:
-        plan = _with_truncation(voxel, survey, recipe, max_blocks)
+        plan = _with_truncation(voxel, survey, input, surface, max_blocks)
         blocks = _estimate_blocks(survey, plan)
         if blocks <= max_blocks:
             break
         if voxel > MAX_VOXEL_M:
             raise ResourceError(
-                f"even voxels of {1e3 * voxel:.0f} mm need more than {recipe.fusion.max_memory_gib:g} GiB",
+                f"even voxels of {1e3 * voxel:.0f} mm need more than {surface.max_memory_gib:g} GiB",
                 place="fusion.max_memory_gib",
                 hint="allow more memory, or check that poses and depth are in metres",
             )
         voxel *= 1.1
-    messages = () if voxel == wanted else (_coarsened(wanted, voxel, recipe),)
+    messages = () if voxel == wanted else (_coarsened(wanted, voxel, surface),)
     return replace(plan, blocks=blocks, messages=messages)
 
 
-def _coarsened(wanted_m: float, voxel_m: float, recipe: Recipe) -> str:
+def _coarsened(wanted_m: float, voxel_m: float, surface: SurfaceSection) -> str:
     return (
         f"voxels of {1e3 * wanted_m:.1f} mm would need more than fusion.max_memory_gib = "
-        f"{recipe.fusion.max_memory_gib:g}; {1e3 * voxel_m:.1f} mm were used"
+        f"{surface.max_memory_gib:g}; {1e3 * voxel_m:.1f} mm were used"
     )
 
 
-def _voxel(scan: Scan, survey: Survey, recipe: Recipe) -> float:
+def _voxel(scan: Scan, survey: Survey, surface: SurfaceSection) -> float:
     """Edge of a voxel [m]: the recipe's, or no finer than depth noise and the thermal camera's footprint support."""
-    if recipe.fusion.voxel_mm != "auto":
-        return recipe.fusion.voxel_mm / 1e3
+    if surface.voxel_mm != "auto":
+        return surface.voxel_mm / 1e3
     z = survey.median_range_m
     footprint = 0.0 if scan.thermal is None else z / scan.thermal.camera.lens.focal_px
     return float(
@@ -155,15 +154,17 @@ def _voxel(scan: Scan, survey: Survey, recipe: Recipe) -> float:
     )
 
 
-def _with_truncation(voxel: float, survey: Survey, recipe: Recipe, max_blocks: int) -> GridPlan:
+def _with_truncation(
+    voxel: float, survey: Survey, input: InputSection, surface: SurfaceSection, max_blocks: int
+) -> GridPlan:
     """Truncation and far limit that go with a voxel and the noise at the subject's distance."""
     z, noise = survey.median_range_m, survey.noise_m_at_1m
-    if recipe.fusion.truncation_voxels == "auto":
+    if surface.truncation_voxels == "auto":
         truncation = max(MIN_TRUNCATION_VOXELS * voxel, MIN_TRUNCATION_M, TRUNCATION_PER_NOISE * noise * z**2)
     else:
-        truncation = recipe.fusion.truncation_voxels * voxel
+        truncation = surface.truncation_voxels * voxel
     far = max(float(np.sqrt(FAR_NOISE_PER_TRUNCATION * truncation / noise)), FAR_PER_MEDIAN * z)
-    return GridPlan(voxel, truncation, min(far, recipe.input.max_depth_m), 0, max_blocks, ())
+    return GridPlan(voxel, truncation, min(far, input.max_depth_m), 0, max_blocks, ())
 
 
 def _estimate_blocks(survey: Survey, plan: GridPlan) -> int:
@@ -274,7 +275,14 @@ class VoxelGrid:
 
 
 def integrate_frames(
-    survey: Survey, frames: Frames, poses: FramePoses, plan: GridPlan, recipe: Recipe, progress: Progress | None
+    survey: Survey,
+    frames: Frames,
+    poses: FramePoses,
+    plan: GridPlan,
+    *,
+    input: InputSection,
+    surface: SurfaceSection,
+    progress: Progress = silent,
 ) -> tuple[VoxelGrid, GridPlan]:
     """All frames into a grid. Should the estimate have been far too low, once more with coarser voxels."""
     while True:
@@ -283,10 +291,9 @@ def integrate_frames(
             if not grid.integrate(depth, poses.T_world_depth[n]):
                 full = True
                 break
-            if progress is not None:
-                progress("surface", n + 1, len(poses.frame))
+            progress("surface", n + 1, len(poses.frame))
         if not full:
             return grid, plan
-        coarser = _with_truncation(1.25 * plan.voxel_m, survey, recipe, plan.max_blocks)
-        message = _coarsened(plan.voxel_m, coarser.voxel_m, recipe)
+        coarser = _with_truncation(1.25 * plan.voxel_m, survey, input, surface, plan.max_blocks)
+        message = _coarsened(plan.voxel_m, coarser.voxel_m, surface)
         plan = replace(coarser, blocks=plan.max_blocks, messages=(*plan.messages, message))

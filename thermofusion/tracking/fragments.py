@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..geometry.rigid import invert
 from ..types import Float, Float32
-from .frames import Frame
+from .frames import TrackingFrame
 from .maps import DepthMap, Intrinsics
 
 SAMPLES = 4000
@@ -20,19 +20,17 @@ MIN_SHARE = 1 / 3  # of the frames that must see a pixel
 
 @dataclass(frozen=True, eq=False)
 class Fragment:
-    """frames : (N,) positions in the depth stream. T_middle_frame : (N, 4, 4). map : averaged depth, middle's view."""
+    """frames : (N,) positions in the depth stream. T_middle_frame : (N, 4, 4). map : averaged depth, middle's view.
+    up : (3,) in the middle's camera: away from the floor where the middle saw it, else up in the image.
+    """
 
     frames: NDArray[np.intp]
     T_middle_frame: Float
     map: DepthMap
-
-    @property
-    def middle(self) -> int:
-        """Position in the depth stream of the frame in whose view it stands."""
-        return int(self.frames[len(self.frames) // 2])
+    up: Float
 
 
-def build_fragment(frames: Sequence[Frame], T: Float, intrinsics: Intrinsics) -> Fragment:
+def build_fragment(frames: Sequence[TrackingFrame], T: Float, intrinsics: Intrinsics) -> Fragment:
     """Average the frames' depth in the view of the middle one.
 
     T : (N, 4, 4) poses in any common frame. Every frame's points are projected into the middle view; what lies behind
@@ -59,8 +57,12 @@ def build_fragment(frames: Sequence[Frame], T: Float, intrinsics: Intrinsics) ->
     depth = _average(np.concatenate(pixels), np.concatenate(depths), h * w, len(frames)).reshape(h, w)
     texture = frames[middle].map.texture
     intensity = None if texture is None else texture[:, 0].reshape(h, w)
+    floor = frames[middle].floor
     return Fragment(
-        np.array([f.index for f in frames]), T_middle_frame, DepthMap.of(depth, intrinsics, SAMPLES, intensity)
+        np.array([f.index for f in frames]),
+        T_middle_frame,
+        DepthMap.of(depth, intrinsics, SAMPLES, intensity),
+        np.array([0.0, -1.0, 0.0]) if floor is None else floor[:3],
     )
 
 

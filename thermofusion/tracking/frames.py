@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -13,9 +13,9 @@ from ..depth.filter import read_ahead
 from ..depth.subject import SubjectFrames
 from ..geometry.camera import project
 from ..geometry.rigid import transform_points
-from ..recipe import Recipe
+from ..recipe import InputSection, SubjectSection, TrackingSection
 from ..scans.pairing import pair_color
-from ..types import Float, Float32, Scan
+from ..types import Float, Float32, Int, Scan
 from .maps import DepthMap, Intrinsics
 
 WIDTH_PX = 320  # images are brought down to about this width
@@ -30,78 +30,80 @@ SLIDES_BELOW = 0.1  # `stiffness_of` cylinders, spheres and bowls is 0.06 (what 
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class TrackingFrame:
     """A depth frame as tracking uses it: coarse, subject only.
 
-    depth_m : (H, W) float32, NaN = none. map : its points, normals, texture.
+    index : position in the depth stream. depth_m : (H, W) float32, NaN = none. map : its points, normals, texture.
+    floor : (4,) `[n, d]` in the frame's camera, n·p + d = height in m, or None where none was seen.
     """
 
     index: int
     time_s: float
     depth_m: Float32
     map: DepthMap
+    floor: Float | None
 
     @property
     def empty(self) -> bool:
         return bool(np.isfinite(self.depth_m).mean() < MIN_VALID_SHARE)
 
 
+@dataclass(frozen=True, eq=False)
 class TrackingFrames:
     """Loads frames, ahead on threads.
 
-    Attributes
-    ----------
-    intrinsics : (fx, fy, cx, cy) of the coarse images. subject : the full frames.
-    slides : the shape alone leaves some motion free, as a cylinder's turn about its axis. uses_color : so texture has
-    to help, and there is some.
+    scan, subject : the recording, and its full frames. step : edge of a cell of full pixels that becomes one coarse
+    pixel. intrinsics : (fx, fy, cx, cy) of the coarse images.
+    slides : the shape alone leaves some motion free, as a cylinder's turn about its axis. color_of : (N,) position in
+    the colour stream of every depth frame's picture, -1 = none, where texture has to help and there is some; or None.
     zoom : depth is multiplied by it, so that a limit means the same for a toy at 30 cm as for a person at 1 m.
     """
 
-    def __init__(self, scan: Scan, recipe: Recipe) -> None:
-        self._scan, self.subject = scan, SubjectFrames(scan, recipe)
-        camera = self.subject.camera
-        self._step = s = max(1, round(camera.width_px / WIDTH_PX))
-        K = camera.K
+    scan: Scan
+    subject: SubjectFrames
+    step: int
+    intrinsics: Intrinsics
+    slides: bool = False
+    color_of: Int | None = None
+    zoom: float = 1.0
+
+    @classmethod
+    def of(
+        cls, scan: Scan, *, input: InputSection, subject: SubjectSection, tracking: TrackingSection
+    ) -> TrackingFrames:
+        """Of a recording; a few probes tell its distance and whether its shape slides."""
+        full = SubjectFrames(scan, input=input, subject=subject)
+        s = max(1, round(full.camera.width_px / WIDTH_PX))
+        K = full.camera.K
         # the centre of a cell of s x s pixels lies (s - 1)/2 from its first pixel's centre
         cx, cy = (K[0, 2] - (s - 1) / 2) / s, (K[1, 2] - (s - 1) / 2) / s
-        self.intrinsics: Intrinsics = (K[0, 0] / s, K[1, 1] / s, cx, cy)
-        self.uses_color, self.zoom = False, 1.0
-        probes = [self.load(i) for i in self._probes()]
+        frames = cls(scan, full, s, (K[0, 0] / s, K[1, 1] / s, cx, cy))
+        probes = [frames.load(i) for i in _probes(scan)]
         near = [float(np.nanmedian(f.depth_m)) for f in probes if not f.empty]
-        if near and np.median(near) < NEAR_M:
-            self.zoom = 1 / float(np.median(near))
+        zoom = 1 / float(np.median(near)) if near and np.median(near) < NEAR_M else 1.0
         stiffness = [k for f in probes if np.isfinite(k := stiffness_of(f.map))]
-        self.slides = bool(stiffness and np.median(stiffness) < SLIDES_BELOW)
-        if self.slides and recipe.tracking.color and scan.color is not None:
-            self._color_of = pair_color(scan, recipe.input.pair_tolerance_ms).color_index
-            self.uses_color = True
+        slides = bool(stiffness and np.median(stiffness) < SLIDES_BELOW)
+        helped = slides and tracking.color and scan.color is not None
+        color_of = pair_color(scan, input.pair_tolerance_ms).color_index if helped else None
+        return replace(frames, slides=slides, color_of=color_of, zoom=zoom)
 
-    def load(self, i: int) -> Frame:
+    def load(self, i: int) -> TrackingFrame:
         """Frame i of the depth stream."""
-        depth = coarse_depth(self.subject.load(i), self._step) * np.float32(self.zoom)
-        intensity = self._intensity(i, depth) if self.uses_color else None
-        return Frame(
-            i, float(self._scan.depth.times_s[i]), depth, DepthMap.of(depth, self.intrinsics, SAMPLES, intensity)
-        )
+        full, floor = self.subject.load(i)
+        depth = coarse_depth(full, self.step) * np.float32(self.zoom)
+        depth_map = DepthMap.of(depth, self.intrinsics, SAMPLES, self._intensity(i, depth))
+        return TrackingFrame(i, float(self.scan.depth.times_s[i]), depth, depth_map, floor)
 
-    def read_ahead(self, indices: NDArray[np.intp]) -> Iterator[Frame]:
-        """Frames in order, a few prepared ahead."""
+    def read_ahead(self, indices: NDArray[np.intp]) -> Iterator[TrackingFrame]:
+        """The frames at positions (N,) of the depth stream, in that order, a few prepared ahead."""
         return read_ahead(self.load, indices.tolist())
-
-    def up(self, i: int) -> Float:
-        """(3,) in frame i's camera: away from the floor where it is seen, else up in the image."""
-        floor = self.subject.floors.get(i)
-        return np.array([0.0, -1.0, 0.0]) if floor is None else floor.plane[:3]
-
-    def _probes(self) -> list[int]:
-        """A few usable frames, spread through the recording."""
-        usable = np.flatnonzero(self._scan.depth.usable)
-        return usable[np.linspace(0, len(usable) - 1, min(PROBES, len(usable))).astype(int)].tolist()
 
     def _intensity(self, i: int, depth: Float32) -> Float32 | None:
         """Local contrast of the colour image at every depth pixel, about 1 in spread; NaN where there is none."""
-        rig, stream, color = self._scan.rig, self._scan.color, int(self._color_of[i])
-        if color < 0 or stream is None or rig.color is None or rig.T_color_depth is None:
+        rig, stream = self.scan.rig, self.scan.color
+        if self.color_of is None or stream is None or rig.color is None or rig.T_color_depth is None:
+            return None
+        if (color := int(self.color_of[i])) < 0:
             return None
         grey = cv2.cvtColor(stream.load(color), cv2.COLOR_RGB2GRAY).astype(np.float32)
         step = max(1, round(grey.shape[1] / WIDTH_PX))
@@ -117,6 +119,12 @@ class TrackingFrames:
         on_image[:, v, u] = np.nan_to_num(uv.T, nan=-10)
         cv2.remap(contrast, on_image[0], on_image[1], cv2.INTER_LINEAR, out, cv2.BORDER_CONSTANT, float("nan"))
         return out
+
+
+def _probes(scan: Scan) -> list[int]:
+    """A few usable frames, spread through the recording."""
+    usable = np.flatnonzero(scan.depth.usable)
+    return usable[np.linspace(0, len(usable) - 1, min(PROBES, len(usable))).astype(int)].tolist()
 
 
 def coarse_depth(depth_m: Float32, step: int) -> Float32:

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.rigid import invert, rotation_angle_deg, se3_exp, se3_log
-from ..recipe import Recipe, TrackingSection
+from ..progress import Progress
+from ..recipe import TrackingSection
 from ..types import Float
 from .fragments import Fragment, build_fragment
-from .frames import Frame, TrackingFrames
-from .maps import DepthMap
+from .frames import TrackingFrame, TrackingFrames
+from .maps import DepthMap, Intrinsics
 from .registration import REACH_M, Partners, agreement, find_partners, register
 
 REACHES_M = (0.08, 0.05, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03)
@@ -31,7 +31,8 @@ class Segment:
     """Frames tracked without a break.
 
     frames : (N,) positions in the depth stream. T : (N, 4, 4) in the segment's own frame. fitness, residual_mm : (N,)
-    of the step to each frame, NaN for the first. samples : (N,) points of each frame. fragments : of these frames.
+    of the step to each frame, NaN for the first. samples : (N,) points of each frame. floors : N planes (4,) in
+    each frame's camera, None where none was seen. fragments : of these frames.
     """
 
     frames: NDArray[np.intp]
@@ -39,40 +40,47 @@ class Segment:
     fitness: Float
     residual_mm: Float
     samples: tuple[DepthMap, ...]
+    floors: tuple[Float | None, ...]
     fragments: tuple[Fragment, ...]
 
 
 def odometry(
-    frames: TrackingFrames, indices: NDArray[np.intp], recipe: Recipe, progress: Callable[[int, int], None]
+    frames: TrackingFrames, indices: NDArray[np.intp], tracking: TrackingSection, progress: Progress
 ) -> list[Segment]:
-    """Tracks frames in order; a step that fails its test begins a new segment. Empty frames are left out."""
+    """Tracks frames (N,), positions in the depth stream, in order; a step that fails its test begins a new segment.
+
+    Empty frames are left out.
+    """
     segments: list[GrowingSegment] = []
     for n, frame in enumerate(frames.read_ahead(indices)):
-        progress(n, len(indices))
+        progress("track", n, len(indices))
         if frame.empty:
             continue
         if not (segments and segments[-1].take(frame)):
-            segments.append(GrowingSegment(frame, frames, recipe))
+            segments.append(GrowingSegment(frame, frames.intrinsics, tracking))
     return [s.finished() for s in segments]
 
 
 class GrowingSegment:
     """A segment while it grows: its last frame, the motion of the last step, and frames not yet in a fragment."""
 
-    def __init__(self, frame: Frame, frames: TrackingFrames, recipe: Recipe, T: Float | None = None) -> None:
-        self._source, self._recipe = frames, recipe
+    def __init__(
+        self, frame: TrackingFrame, intrinsics: Intrinsics, tracking: TrackingSection, T: Float | None = None
+    ) -> None:
+        self._intrinsics, self._tracking = intrinsics, tracking
         self._frames: list[int] = []
         self._T: list[Float] = []
         self._chain: list[Float] = []  # as _T, but always from frame to frame: what holds a fragment together
         self._fitness: list[float] = []
         self._residual: list[float] = []
         self._samples: list[DepthMap] = []
+        self._floors: list[Float | None] = []
         self._fragments: list[Fragment] = []
-        self._pending: list[Frame] = []
+        self._pending: list[TrackingFrame] = []
         self._velocity = np.zeros(6)  # twist per second
         self._append(frame, np.eye(4) if T is None else T, None, np.eye(4))
 
-    def take(self, frame: Frame) -> bool:
+    def take(self, frame: TrackingFrame) -> bool:
         """Append a frame if the motion to it can be believed."""
         if frame.index - self._frames[-1] > MAX_GAP_FRAMES:
             return False
@@ -80,20 +88,20 @@ class GrowingSegment:
         for start, reaches in ((se3_exp(self._velocity * dt_s), REACHES_M), (np.eye(4), RESCUE_REACHES_M)):
             T_last_now, _ = register(frame.map, [(self._last.map, np.eye(4))], start, reaches, tolerance=STEP_TOLERANCE)
             partners = find_partners(frame.map, self._last.map, T_last_now, REACH_M)
-            believed = _believed(partners, self._recipe.tracking) and _possible(T_last_now, dt_s)
+            believed = _believed(partners, self._tracking) and _possible(T_last_now, dt_s)
             if believed and agreement(frame.map, self._last.map, T_last_now, stride=2) >= MIN_AGREEMENT:
                 self._append(frame, self._T[-1] @ T_last_now, partners, T_last_now)
                 self._velocity = se3_log(T_last_now) / dt_s
                 return True
         return False
 
-    def append_at(self, frame: Frame, T: Float) -> None:
+    def append_at(self, frame: TrackingFrame, T: Float) -> None:
         """Append a frame whose pose is known from elsewhere (a recorded trajectory). Within a fragment its motion is
         still measured: recorded poses may jitter."""
         start, last = invert(self._T[-1]) @ T, [(self._last.map, np.eye(4))]
         T_last_now, _ = register(frame.map, last, start, REACHES_M[1:], tolerance=STEP_TOLERANCE)
         partners = find_partners(frame.map, self._last.map, T_last_now, REACH_M)
-        if not _believed(partners, self._recipe.tracking):
+        if not _believed(partners, self._tracking):
             T_last_now = start
         self._append(frame, T, partners, T_last_now)
 
@@ -107,24 +115,26 @@ class GrowingSegment:
             np.array(self._fitness),
             np.array(self._residual),
             tuple(self._samples),
+            tuple(self._floors),
             tuple(self._fragments),
         )
 
-    def _append(self, frame: Frame, T: Float, partners: Partners | None, T_last_now: Float) -> None:
+    def _append(self, frame: TrackingFrame, T: Float, partners: Partners | None, T_last_now: Float) -> None:
         self._frames.append(frame.index)
         self._T.append(T)
         self._chain.append(self._chain[-1] @ T_last_now if self._chain else T)
         self._fitness.append(np.nan if partners is None else partners.share)
         self._residual.append(np.nan if partners is None else partners.residual_mm_at_1m)
         self._samples.append(frame.map.sample_only())
+        self._floors.append(frame.floor)
         self._pending.append(frame)
         self._last = frame
-        if len(self._pending) == self._recipe.tracking.fragment_frames:
+        if len(self._pending) == self._tracking.fragment_frames:
             self._close_fragment()
 
     def _close_fragment(self) -> None:
         poses = np.array(self._chain[-len(self._pending) :])
-        self._fragments.append(build_fragment(self._pending, poses, self._source.intrinsics))
+        self._fragments.append(build_fragment(self._pending, poses, self._intrinsics))
         self._pending = []
 
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..geometry._open3d import o3d
 from ..geometry.rigid import invert, pose, rotation_angle_deg
 from ..recipe import TrackingSection
 from ..types import Float
@@ -55,22 +54,21 @@ def find_join(
     probe: Fragment,
     T_segment_probe: Float,
     guesses: Sequence[Float],
-    up: Float,
-    gate: TrackingSection,
+    tracking: TrackingSection,
 ) -> Join | None:
     """Where a segment's fragments belong among the main ones, or None if nothing convinces.
 
     main, probe, T_segment_probe : placed fragments; a fragment of the segment and its pose in it. guesses :
-    T_main_segment from neighbours in time. up : (3,) in the probe's camera frame, the axis people walk round. An
-    ambiguous join is returned as such; it is for the caller to leave it.
+    T_main_segment from neighbours in time, (4, 4) each. An ambiguous join is returned as such; it is for the caller to
+    leave it.
     """
-    nearby = [(how, T @ T_segment_probe) for how, T in _near(guesses, probe, up, T_segment_probe)]
+    nearby = [(how, T @ T_segment_probe) for how, T in _near(guesses, probe, T_segment_probe)]
     near = _shortlist(main, probe, nearby)
     far = [("at a place seen before", T) for _, T in _spread(main, MAX_PLACES)]
     found = near + _shortlist(main, probe, far)
     if not any(c.agreement >= MIN_AGREEMENT for c in found):
         found += _shortlist(main, probe, list(_by_shape(main, probe)))
-    joins = [j for c in found if (j := _settled(main, probe, c, gate)) is not None]
+    joins = [j for c in found if (j := _settled(main, probe, c, tracking)) is not None]
     if not joins:
         return None
     best = max(joins, key=lambda j: j.agreement * min(j.shared, 0.5))
@@ -78,13 +76,13 @@ def find_join(
     return replace(best, T_main_segment=best.T_main_segment @ invert(T_segment_probe), ambiguous=bool(rivals))
 
 
-def _near(guesses: Sequence[Float], probe: Fragment, up: Float, T_segment_probe: Float) -> Iterable[tuple[str, Float]]:
-    """The guesses themselves, and walks round the subject from there."""
+def _near(guesses: Sequence[Float], probe: Fragment, T_segment_probe: Float) -> Iterable[tuple[str, Float]]:
+    """The guesses themselves, and walks round the subject, about the probe's `up`, from there."""
     yield from (("from the frames before or after", T) for T in guesses)
     centre = np.median(probe.map.sample, axis=0) if len(probe.map.sample) else np.zeros(3)
     for T in guesses:
         for turn in TURNS_DEG:
-            R = Rotation.from_rotvec(np.radians(turn) * up).as_matrix()
+            R = Rotation.from_rotvec(np.radians(turn) * probe.up).as_matrix()
             T_turn = pose(R, centre - R @ centre)  # of the camera, about an upright axis through the subject
             yield f"round the subject by about {abs(turn)}°", T @ T_segment_probe @ T_turn @ invert(T_segment_probe)
 
@@ -100,13 +98,13 @@ def _shortlist(main: Sequence[Placed], probe: Fragment, tries: Sequence[tuple[st
     return sorted(found, key=lambda j: -j.agreement * min(j.shared, 0.5))[:SHORTLIST]
 
 
-def _settled(main: Sequence[Placed], probe: Fragment, join: Join, gate: TrackingSection) -> Join | None:
+def _settled(main: Sequence[Placed], probe: Fragment, join: Join, tracking: TrackingSection) -> Join | None:
     """A hypothesis aligned finely, if it still convinces."""
     T, partners = register(probe.map, _targets(main, join.T_main_segment), join.T_main_segment, FINE_REACHES_M)
     fine = _judged(main, probe, T, join.how)
-    if partners is None or fine is None or fine.agreement < max(MIN_AGREEMENT, gate.min_fitness):
+    if partners is None or fine is None or fine.agreement < max(MIN_AGREEMENT, tracking.min_fitness):
         return None
-    return fine if partners.residual_mm_at_1m <= 0.5 * gate.max_residual_mm else None
+    return fine if partners.residual_mm_at_1m <= 0.5 * tracking.max_residual_mm else None
 
 
 def _judged(main: Sequence[Placed], probe: Fragment, T: Float, how: str, stride: int = 1) -> Join | None:
@@ -152,6 +150,8 @@ def _by_shape(main: Sequence[Placed], probe: Fragment) -> Iterable[tuple[str, Fl
 
 def _by_features(source: DepthMap, target: DepthMap) -> Float | None:
     """T_target_source from FPFH features and RANSAC (fixed seed), for views too far apart for anything else."""
+    from ..geometry._open3d import o3d
+
     r = o3d.pipelines.registration
     if not len(source.sample) or not len(target.sample):
         return None

@@ -10,7 +10,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from ..errors import ScanError
 from ..geometry.rigid import interpolate_trajectory, invert, se3_exp, se3_log
-from ..progress import Progress
-from ..recipe import Recipe
+from ..progress import Progress, silent
+from ..recipe import InputSection, SubjectSection, TrackingSection
 from ..types import Bool, Float, Scan, Trajectory
 from .fragments import Fragment
 from .frames import TrackingFrames
@@ -70,6 +70,27 @@ class TrackingResult:
     messages: tuple[str, ...]
 
 
+def locate(
+    scan: Scan,
+    *,
+    input: InputSection,
+    subject: SubjectSection,
+    tracking: TrackingSection,
+    progress: Progress = silent,
+) -> TrackingResult:
+    """Where the depth camera was: the recorded trajectory as it is, or refined, or estimated from the depth alone.
+
+    Raises ScanError if a recorded trajectory is asked for and there is none, or no frame shows the subject.
+    """
+    if tracking.source == "recorded" and scan.trajectory is None:
+        raise ScanError("no trajectory was recorded", place=scan.root, hint="set tracking.source to auto or estimate")
+    if scan.trajectory is not None and tracking.source != "estimate" and not tracking.refine:
+        return recorded(scan)
+    if tracking.source == "estimate":
+        scan = replace(scan, trajectory=None)
+    return track(scan, input=input, subject=subject, tracking=tracking, progress=progress)
+
+
 def recorded(scan: Scan) -> TrackingResult:
     """The recorded trajectory as it is. Depth frames outside it count as not tracked."""
     assert scan.trajectory is not None
@@ -79,32 +100,35 @@ def recorded(scan: Scan) -> TrackingResult:
     return TrackingResult(scan.trajectory, inside, nan, nan, (), 0, True, None, "recorded", ())
 
 
-def track(scan: Scan, recipe: Recipe, *, progress: Progress | None = None) -> TrackingResult:
+def track(
+    scan: Scan,
+    *,
+    input: InputSection,
+    subject: SubjectSection,
+    tracking: TrackingSection,
+    progress: Progress = silent,
+) -> TrackingResult:
     """Track the depth camera through a scan; a recorded trajectory, if there is one, is the start.
 
     Raises ScanError if no frame shows the subject.
     """
-    frames = TrackingFrames(scan, recipe)
+    frames = TrackingFrames.of(scan, input=input, subject=subject, tracking=tracking)
     indices = np.flatnonzero(scan.depth.usable)
-
-    def step(done: int, total: int) -> None:
-        if progress:
-            progress("track", done, total)
-
     if scan.trajectory is not None:
-        segments = _from_recorded(scan, scan.trajectory, frames, indices, recipe)
+        T, valid = interpolate_trajectory(scan.trajectory, scan.depth.times_s, max_gap_s=input.max_pose_gap_ms / 1e3)
+        segments = _along(T, frames, indices[valid[indices]], tracking)
     else:
-        segments = odometry(frames, indices, recipe, step)
+        segments = odometry(frames, indices, tracking, progress)
     if not segments:
         raise ScanError(
             "no depth frame shows a subject within input.min_depth_m and input.max_depth_m",
             place=scan.root,
             hint="check depth_unit_m and the recipe's range",
         )
-    placed, lost = _join(segments, frames, scan.depth.times_s, recipe)
-    placed, loops, converged, message = _solve(placed, recipe)
-    refined = _refined(placed) if recipe.tracking.refine_to_model else [p.frame_poses() for p in placed]
-    return _result(scan, frames, indices, placed, refined, lost, loops, converged, message)
+    placed, lost = _join(segments, scan.depth.times_s, tracking)
+    placed, loops, converged = _solve(placed, tracking)
+    poses = _refined(placed) if tracking.refine_to_model else [p.frame_poses() for p in placed]
+    return _result(frames, placed, poses, lost, loops, converged)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,18 +147,15 @@ class _Placed:
         return np.concatenate([T @ f.T_middle_frame for f, T in self.fragments])
 
 
-def _from_recorded(
-    scan: Scan, trajectory: Trajectory, frames: TrackingFrames, indices: NDArray[np.intp], recipe: Recipe
-) -> list[Segment]:
-    """One segment with the recorded poses."""
-    T, valid = interpolate_trajectory(trajectory, scan.depth.times_s, max_gap_s=recipe.input.max_pose_gap_ms / 1e3)
+def _along(T: Float, frames: TrackingFrames, indices: NDArray[np.intp], tracking: TrackingSection) -> list[Segment]:
+    """The frames `indices` (N,) as one segment at recorded poses T (F, 4, 4), one for each frame of the stream."""
     T = _zoomed(T, frames.zoom)
     growing: GrowingSegment | None = None
-    for frame in frames.read_ahead(indices[valid[indices]]):
+    for frame in frames.read_ahead(indices):
         if frame.empty:
             continue
         if growing is None:
-            growing = GrowingSegment(frame, frames, recipe, T[frame.index])
+            growing = GrowingSegment(frame, frames.intrinsics, tracking, T[frame.index])
         else:
             growing.append_at(frame, T[frame.index])
     return [] if growing is None else [growing.finished()]
@@ -147,9 +168,7 @@ def _zoomed(T: Float, zoom: float) -> Float:
     return out
 
 
-def _join(
-    segments: list[Segment], frames: TrackingFrames, times_s: Float, recipe: Recipe
-) -> tuple[list[_Placed], list[LostRange]]:
+def _join(segments: list[Segment], times_s: Float, tracking: TrackingSection) -> tuple[list[_Placed], list[LostRange]]:
     """Put segments together around the longest; what cannot be joined is left out, and said."""
     longest = int(np.argmax([len(s.frames) for s in segments]))
     placed = {longest: _Placed(segments[longest], _in_segment(segments[longest]))}
@@ -163,7 +182,7 @@ def _join(
         guesses = _neighbours(k, segments, placed, times_s)
         join = None
         for probe, T in _probes(own, k - 1 in placed, k + 1 in placed):
-            join = find_join(main, probe, T, guesses, frames.up(probe.middle), recipe.tracking)
+            join = find_join(main, probe, T, guesses, tracking)
             if join is not None and not join.ambiguous:
                 break
         if join is None or join.ambiguous:
@@ -226,15 +245,15 @@ def _neighbours(k: int, segments: list[Segment], placed: dict[int, _Placed], tim
     return guesses
 
 
-def _solve(placed: list[_Placed], recipe: Recipe) -> tuple[list[_Placed], int, bool, str | None]:
-    """All fragments in one solution: (placed, loops closed, converged, message)."""
+def _solve(placed: list[_Placed], tracking: TrackingSection) -> tuple[list[_Placed], int, bool]:
+    """All fragments in one solution: (placed, loops closed, converged)."""
     fragments = [f for p in placed for f in p.fragments]
     maps, T = [f.map for f, _ in fragments], np.array([T for _, T in fragments])
     loops, converged = 0, True
     if len(fragments) > 1:
         for reach, stride in ROUNDS:
             edges = overlapping(maps, T, reach, per_map=PARTNERS_PER_FRAGMENT, min_share=MIN_OVERLAP)
-            if not recipe.tracking.loop_closure:
+            if not tracking.loop_closure:
                 edges = [(i, j) for i, j in edges if abs(i - j) < LOOP_APART]
             fixed = len(fragments) // 2
             T, _, converged = solve_jointly(maps, T, edges, reach, fixed=fixed, stride=stride)
@@ -244,8 +263,7 @@ def _solve(placed: list[_Placed], recipe: Recipe) -> tuple[list[_Placed], int, b
         n = len(p.segment.fragments)
         solved.append(_Placed(p.segment, tuple(T[at : at + n])))
         at += n
-    message = None if converged else "the joint solution of the fragments had not settled when it was stopped"
-    return solved, loops, converged, message
+    return solved, loops, converged
 
 
 def _refined(placed: list[_Placed]) -> list[Float]:
@@ -267,16 +285,15 @@ def _refined(placed: list[_Placed]) -> list[Float]:
 
 
 def _result(
-    scan: Scan,
     frames: TrackingFrames,
-    indices: NDArray[np.intp],
     placed: list[_Placed],
     refined: list[Float],
     lost: list[LostRange],
     loops: int,
     converged: bool,
-    message: str | None,
 ) -> TrackingResult:
+    """Everything about the frames of the stream, from the poses (N, 4, 4) of every placed segment's frames."""
+    scan = frames.scan
     n = len(scan.depth)
     T, tracked = np.tile(np.eye(4), (n, 1, 1)), np.zeros(n, bool)
     fitness, residual = np.full(n, np.nan), np.full(n, np.nan)
@@ -287,17 +304,6 @@ def _result(
     T = _zoomed(T, 1 / frames.zoom)
     if scan.trajectory is None:
         T = invert(T[int(np.argmax(tracked))]) @ T
-    messages = [] if message is None else [message]
-    if frames.slides and not frames.uses_color:
-        messages.append("the shape alone leaves some motion free (a cylinder, a sphere); no colour helped to hold it")
-    out = [r for r in lost if r.outcome == "left out"]
-    if out:
-        count, ranges = sum(r.stop - r.start for r in out), ", ".join(f"{r.start}-{r.stop - 1}" for r in out)
-        messages.append(f"{count} of {n} depth frames could not be tracked and are left out (frames {ranges})")
-    joined = [r for r in lost if r.outcome == "joined"]
-    if joined:
-        at = ", ".join(str(r.start) for r in joined)
-        messages.append(f"tracking broke {len(joined)} times (before frames {at}) and was joined again")
     return TrackingResult(
         trajectory=Trajectory(scan.depth.times_s[tracked], T[tracked]),
         tracked=tracked,
@@ -306,18 +312,34 @@ def _result(
         lost=tuple(lost),
         loop_closures=loops,
         converged=converged,
-        floor_plane=_floor(frames, T, tracked, len(indices)),
+        floor_plane=_floor(placed, T, int(scan.depth.usable.sum())),
         source="estimated" if scan.trajectory is None else "refined",
-        messages=tuple(messages),
+        messages=_messages(frames, lost, converged),
     )
 
 
-def _floor(frames: TrackingFrames, T: Float, tracked: Bool, n: int) -> Float | None:
-    """The floor in the world: the median of what the frames saw, if enough saw one and they agree."""
-    seen = [(i, f) for i, f in sorted(frames.subject.floors.items()) if tracked[i]]
+def _messages(frames: TrackingFrames, lost: list[LostRange], converged: bool) -> tuple[str, ...]:
+    messages = [] if converged else ["the joint solution of the fragments had not settled when it was stopped"]
+    if frames.slides and frames.color_of is None:
+        messages.append("the shape alone leaves some motion free (a cylinder, a sphere); no colour helped to hold it")
+    out = [r for r in lost if r.outcome == "left out"]
+    if out:
+        count, ranges = sum(r.stop - r.start for r in out), ", ".join(f"{r.start}-{r.stop - 1}" for r in out)
+        n = len(frames.scan.depth)
+        messages.append(f"{count} of {n} depth frames could not be tracked and are left out (frames {ranges})")
+    joined = [r for r in lost if r.outcome == "joined"]
+    if joined:
+        at = ", ".join(str(r.start) for r in joined)
+        messages.append(f"tracking broke {len(joined)} times (before frames {at}) and was joined again")
+    return tuple(messages)
+
+
+def _floor(placed: list[_Placed], T: Float, n: int) -> Float | None:
+    """The floor in the world: the median of what the frames saw, if enough of n saw one and they agree."""
+    seen = [(i, f) for p in placed for i, f in zip(p.segment.frames, p.segment.floors, strict=True) if f is not None]
     if len(seen) < max(3, MIN_FLOOR_SHARE * n):
         return None
-    planes = np.array([_to_world(f.plane, T[i]) for i, f in seen])
+    planes = np.array([_to_world(f, T[i]) for i, f in seen])
     middle = np.median(planes, axis=0)
     good = (np.abs(planes[:, 3] - middle[3]) < 0.05) & (planes[:, :3] @ middle[:3] > np.cos(np.radians(5)))
     if good.sum() < 0.5 * len(planes):
@@ -331,4 +353,4 @@ def _to_world(plane: Float, T_world_depth: Float) -> Float:
     return np.append(n, plane[3] - n @ T_world_depth[:3, 3])
 
 
-__all__ = ["LostRange", "TrackingResult", "recorded", "track"]
+__all__ = ["LostRange", "TrackingResult", "locate", "recorded", "track"]
