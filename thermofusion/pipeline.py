@@ -8,16 +8,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .errors import RecipeError
 from .progress import Progress, silent
-from .recipe import Recipe
-from .report.summary import result_report, summary
+from .recipe import RENAMED_STAGES, Recipe
+from .report.summary import Steps, result_report, summary
 from .results.folder import Result, load_mesh, write_result
-from .results.stages import StagePlan, Stages, fingerprint
+from .results.stages import Computes, Stage, StagePlan, Stages, fingerprint
 from .scans.check import verify
 from .types import Scan, SurfaceMesh
 from .version import __version__
@@ -27,16 +28,15 @@ if TYPE_CHECKING:
     from .surface.surface import SurfaceResult
     from .tracking.track import TrackingResult
 
-
-# Stage -> the recipe sections it reads. A stage also depends on all stages before it.
-SECTIONS: dict[str, tuple[str, ...]] = {
-    "track": ("input", "subject", "tracking"),
-    "surface": ("input", "subject", "fusion"),
-    "align": ("mapping", "crosscal"),
-    "observe": ("mapping",),
-    "temperature": ("mapping", "emissivity", "radiometry", "crosscal"),
-}
-STAGES = tuple(SECTIONS)
+# A stage is handed exactly the recipe sections that its key holds. It also depends on all stages before it.
+STAGES = (
+    Stage("tracking", ("input", "subject", "tracking")),
+    Stage("surface", ("input", "subject", "surface")),
+    Stage("rig", ("input", "rig")),
+    Stage("mapping", ("input", "mapping")),
+    Stage("temperature", ("mapping", "temperature")),
+)
+STAGE_NAMES = tuple(stage.name for stage in STAGES)
 
 
 def fuse(
@@ -55,52 +55,51 @@ def fuse(
     ----------
     out : result folder; stages stored there are reused where their inputs are unchanged. None: nothing is written.
     progress : called with (stage, done, total).
-    redo_from, until : names of `STAGES`. compare_methods : also compute every other method, for the report.
+    redo_from, until : names of stages. compare_methods : also compute every other method, for the report.
 
     Raises ScanError (unusable input), RecipeError, ResourceError. What was computed before an error stays in `out`.
     """
-    from .rig.align import align_thermal
+    from .mapping.observe import observe
+    from .rig.align import align
     from .surface.surface import fuse_surface
-    from .temperature.solve import measure, see, unmeasured
+    from .temperature.solve import solve, unmeasured
     from .tracking.track import locate
 
     verify(scan)
     folder = None if out is None else Path(out)
-    stages = _stages(scan, folder, redo_from)
-    step = progress
-    last = STAGES.index(until) if until else len(STAGES) - 1
+    first_anew, last = _position(redo_from, len(STAGES)), _position(until, len(STAGES) - 1)
+    stages = _stages(scan, recipe, folder)
+    stages.tidy()
 
-    def run(name: str, compute: Callable[[Progress], Any]) -> Any:
-        if STAGES.index(name) > last:
+    def step(number: int, compute: Computes) -> Any:
+        if number > last:
             return None
-        step(name, 0, 1)
-        value = stages.run(name, _inputs(name, recipe), lambda: compute(step))
-        step(name, 1, 1)
+        name = STAGES[number].name
+        progress(name, 0, 1)
+        value = stages.run(STAGES[number], compute, progress, anew=number >= first_anew)
+        progress(name, 1, 1)
         return value
 
     # 1. Surface
-    read: dict[str, Any] = {"input": recipe.input, "subject": recipe.subject}
-    tracking = run("track", lambda p: locate(scan, **read, tracking=recipe.tracking, progress=p))
-    trajectory = tracking.trajectory
-    surface = run("surface", lambda p: fuse_surface(scan, tracking, **read, surface=recipe.fusion, progress=p))
-    alignment = seen = temperature = casts = None
-    if surface is not None and scan.thermal is None:
-        temperature = unmeasured(scan, surface.mesh, recipe, _axes(scan, tracking, surface))
-    elif surface is not None:
-        # 2. Rig
-        alignment = run("align", lambda p: align_thermal(scan, surface.mesh, trajectory, recipe))
-        # 3. Mapping
-        seen = run("observe", lambda p: see(scan, surface.mesh, trajectory, alignment, recipe))
-        # 4. Temperature, while the pictures' rays are cast on the other core
-        axes = _axes(scan, tracking, surface)
-        if folder is not None and until is None and recipe.output.views:
-            casts = _casting(surface.mesh, axes)
-        temperature = run(
-            "temperature", lambda p: measure(scan, surface.mesh, seen, recipe, axes=axes, compare=compare_methods)
-        )
+    tracking = step(0, partial(locate, scan))
+    surface = step(1, partial(fuse_surface, scan, tracking))
+    rig = mapped = temperature = casts = None
+    if surface is not None:
+        facts = {"recipe": recipe.name, **_axes(scan, tracking, surface)}
+        if scan.thermal is None:
+            temperature = unmeasured(surface.mesh, recipe.temperature, facts)
+        else:
+            # 2. Rig
+            rig = step(2, partial(align, scan, surface.mesh, tracking.trajectory))
+            # 3. Mapping
+            mapped = step(3, partial(observe, scan, surface.mesh, tracking.trajectory, rig))
+            # 4. Temperature, while the pictures' rays are cast on the other core
+            if folder is not None and until is None and recipe.output.views:
+                casts = _casting(surface.mesh, facts)
+            temperature = step(4, partial(solve, scan, surface, mapped, metadata=facts, compare=compare_methods))
 
-    report = result_report(scan, recipe, tracking, surface, alignment, seen, temperature, stages.reused)
-    result = Result(report, trajectory, tracking, surface, alignment, seen, temperature)
+    steps = Steps(tracking, surface, rig, mapped, temperature)
+    result = Result(**vars(steps), report=result_report(scan, recipe, steps, stages.reused))
     if folder is not None:
         write_result(result, recipe, folder, casts)
     return result
@@ -108,16 +107,26 @@ def fuse(
 
 def plan(scan: Scan, recipe: Recipe, out: Path, *, redo_from: str | None = None) -> list[StagePlan]:
     """What `fuse` would compute or reuse, and why; nothing is computed."""
-    stages = _stages(scan, out, redo_from)
-    return [stages.plan(name, _inputs(name, recipe)) for name in STAGES]
+    stages, first = _stages(scan, recipe, out), _position(redo_from, len(STAGES))
+    return [stages.plan(stage, anew=number >= first) for number, stage in enumerate(STAGES)]
 
 
-def _casting(surface: SurfaceMesh, axes: dict[str, str]) -> Future[list[Cast]]:
+def _position(name: str | None, default: int) -> int:
+    """Where a stage stands, by its name or an old one. Raises RecipeError for an unknown one."""
+    if name is None:
+        return default
+    name = RENAMED_STAGES.get(name, name)
+    if name not in STAGE_NAMES:
+        raise RecipeError(f"there is no stage '{name}'", hint=f"stages are {', '.join(STAGE_NAMES)}")
+    return STAGE_NAMES.index(name)
+
+
+def _casting(surface: SurfaceMesh, facts: dict[str, str]) -> Future[list[Cast]]:
     from .export import axes_of
     from .report.pictures import cast_surface
 
     pool = ThreadPoolExecutor(max_workers=1)
-    casts = pool.submit(cast_surface, surface, axes_of(axes))
+    casts = pool.submit(cast_surface, surface, axes_of(facts))
     pool.shutdown(wait=False)
     return casts
 
@@ -131,13 +140,8 @@ def _axes(scan: Scan, tracking: TrackingResult, surface: SurfaceResult) -> dict[
     return view_axes(tracking.trajectory.T_world_depth, centre_m, normal, scan.depth_up)
 
 
-def _stages(scan: Scan, folder: Path | None, redo_from: str | None) -> Stages:
-    base = {"thermofusion": __version__, "scan": fingerprint(scan)}
-    return Stages(folder, base, redo_from=redo_from, order=STAGES)
+def _stages(scan: Scan, recipe: Recipe, folder: Path | None) -> Stages:
+    return Stages(folder, {"thermofusion": __version__, "scan": fingerprint(scan)}, recipe)
 
 
-def _inputs(name: str, recipe: Recipe) -> dict[str, Any]:
-    return {section: getattr(recipe, section) for section in SECTIONS[name]}
-
-
-__all__ = ["STAGES", "Result", "fuse", "load_mesh", "plan", "summary", "write_result"]
+__all__ = ["STAGES", "STAGE_NAMES", "Result", "fuse", "load_mesh", "plan", "summary", "write_result"]

@@ -55,7 +55,7 @@ def main(argv: list[str] | None = None) -> None:
     except (KeyboardInterrupt, typer.Abort):
         fail("interrupted; what was computed is kept and the next run continues from there", INTERRUPTED, as_json)
     except MemoryError:
-        fail("out of memory; choose a larger fusion.voxel_mm or a smaller --max-memory", 5, as_json)
+        fail("out of memory; choose a larger surface.voxel_mm or a smaller --max-memory", 5, as_json)
     except Exception as e:
         if hasattr(e, "format_message"):  # a usage error of the command line itself
             fail(f"{e.format_message()} (see --help)", 2, as_json)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from ..errors import QualityError, RecipeError
+from ..errors import QualityError
 from .console import emit, low_high, note, progress
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
@@ -43,13 +43,10 @@ def run(
 
     overrides = list(set_ or ())
     if max_memory is not None:
-        overrides.append(f"fusion.max_memory_gib={max_memory}")
+        overrides.append(f"surface.max_memory_gib={max_memory}")
     if method not in (None, "all"):
-        overrides.append(f"radiometry.method={method}")
-    chosen = load_recipe(recipe, overrides)
-    for stage in (from_, until):
-        if stage is not None and stage not in pipeline.STAGES:
-            raise RecipeError(f"there is no stage '{stage}'", hint=f"stages are {', '.join(pipeline.STAGES)}")
+        overrides.append(f"temperature.method={method}")
+    chosen = load_recipe(recipe, overrides, note=note)
     recording = open_scan(scan, format=format)
     if dry_run:
         plans = pipeline.plan(recording, chosen, out, redo_from=from_)
@@ -59,7 +56,7 @@ def run(
         result = pipeline.fuse(
             recording, chosen, out=out, progress=step, redo_from=from_, until=until, compare_methods=method == "all"
         )
-    emit(result.report, pipeline.summary(result, out), json)
+    emit(result.report, pipeline.summary(result.report, out), json)
     return QualityError.exit_code if result.report["quality"]["failed"] else 0
 
 
@@ -76,7 +73,7 @@ def demo(
     scan = open_scan(data_dir() / "demo")
     with progress(json) as step:
         result = pipeline.fuse(scan, load_recipe("torso"), out=out, progress=step)
-    emit(result.report, pipeline.summary(result, out), json)
+    emit(result.report, pipeline.summary(result.report, out), json)
     note(f"look at {out / 'views' / 'overview.png'}; open {out / 'mesh.glb'} in Blender, {out / 'mesh.ply'} in MeshLab")
     return QualityError.exit_code if result.report["quality"]["failed"] else 0
 

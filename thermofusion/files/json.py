@@ -1,8 +1,4 @@
-"""The result folder: files that appear whole or not at all, and stages that are not computed twice.
-
-A stage's key is the hash of everything that goes into it: the scan's fingerprint, the recipe sections it reads, the
-program's version, and the key of the stage before. A stored artifact with the same key is taken as it is.
-"""
+"""JSON for people and programs, from whatever the package computes with."""
 
 from __future__ import annotations
 
@@ -18,22 +14,23 @@ from pydantic import BaseModel
 
 def to_json(value: object) -> str:
     """JSON for people and programs: NaN becomes null, arrays become lists."""
-    return json.dumps(_plain(value), indent=1, allow_nan=False, ensure_ascii=False)
+    return json.dumps(plain(value), indent=1, allow_nan=False, ensure_ascii=False)
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """A value as JSON knows it: dataclasses, models and mappings as dicts, arrays as lists, NaN as None."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, BaseModel):
-        return _plain(value.model_dump())
+        return plain(value.model_dump())
     if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
+        return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
+        return [plain(v) for v in value]
     if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, np.generic):
-        return _plain(value.item())
+        return plain(value.item())
     if isinstance(value, float):
         return value if np.isfinite(value) else None
     if isinstance(value, Path):

@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from ..errors import ScanError
 from ..robust import Statistics
 from ..temperature.blend import BlendResult
-from ..temperature.crosscal import CrosscalResult
+from ..temperature.crosscal import Calibration
 from ..types import Bool, Float, SurfaceMesh
 from .leftout import Bench
 
@@ -76,12 +76,12 @@ def map_error(bench: Bench, dense: Bench, surface: SurfaceMesh, sigma_K: NDArray
 
     Raises ScanError where halves of the views cannot be compared.
     """
-    count = np.bincount(bench.observations.vertex[bench.counts], minlength=len(bench))
+    count = np.bincount(bench.problem.observations.vertex[bench.problem.counts], minlength=len(bench))
     wanted = np.flatnonzero(bench.well_seen & (count > 0))
     if not len(wanted):
         raise ScanError("no spot was seen by two views under 60°")
-    arc = int(np.clip(np.median(count[wanted]) // 2, 1, len(bench.seen_views) // 2))
-    everything = np.ones(bench.n_views, bool)
+    arc = int(np.clip(np.median(count[wanted]) // 2, 1, len(bench.problem.seen_views) // 2))
+    everything = np.ones(bench.problem.n_views, bool)
     calibration = bench.calibrate(everything)
     whole = bench.blend(everything, calibration)
     cuts, random, covered = [], [], np.zeros(len(wanted), bool)
@@ -89,7 +89,7 @@ def map_error(bench: Bench, dense: Bench, surface: SurfaceMesh, sigma_K: NDArray
         cuts.append(_halves(bench, calibration, arc, shift))
         error = cuts[k].error_K
         if calibration is not None:
-            error = error + _calibration_error(bench, calibration, surface.vertices_m[bench.vertices], k)
+            error = error + _calibration_error(bench, calibration, surface.vertices_m[bench.problem.vertices], k)
         covered |= np.isfinite(error[wanted])
         random.append(_completed(error[wanted], _own(whole)[wanted], count[wanted]))
 
@@ -98,7 +98,7 @@ def map_error(bench: Bench, dense: Bench, surface: SurfaceMesh, sigma_K: NDArray
     # shared parts are taken as normal, of unknown sign
     error = (np.concatenate(random)[:, None] + np.tile(np.hypot(declared, spread), len(cuts))[:, None] * NODES).ravel()
     weight = np.tile(NODE_WEIGHTS, len(wanted) * len(cuts))
-    sigma = np.repeat(np.tile(sigma_K[bench.vertices][wanted].astype(np.float64), len(cuts)), len(NODES))
+    sigma = np.repeat(np.tile(sigma_K[bench.problem.vertices][wanted].astype(np.float64), len(cuts)), len(NODES))
     known = np.isfinite(sigma) & (sigma > 0)
     return MapError(
         error=Statistics.of(error, sigma, weight),
@@ -112,7 +112,7 @@ def map_error(bench: Bench, dense: Bench, surface: SurfaceMesh, sigma_K: NDArray
     )
 
 
-def _declared(bench: Bench, calibration: CrosscalResult | None, whole: BlendResult) -> Float:
+def _declared(bench: Bench, calibration: Calibration | None, whole: BlendResult) -> Float:
     """(V,) K, what the budget holds of errors that all views share.
 
     The fitted shape of ε(θ) is one of them as far as its uncertainty is no matter of noise (normals bend it).
@@ -122,8 +122,14 @@ def _declared(bench: Bench, calibration: CrosscalResult | None, whole: BlendResu
         (np.nan_to_num(parts[k].astype(np.float64)) ** 2 for k in DECLARED if k in parts), np.zeros(len(bench))
     )
     if calibration is not None:
-        bend = np.sqrt(max(calibration.shape_sigma**2 - float(calibration.covariance[-2, -2]), 0.0))
-        bent = bench.blend(np.ones(bench.n_views, bool), replace(calibration, shape=calibration.shape + bend))
+        bend = np.sqrt(
+            max(
+                calibration.shape_sigma**2
+                - float(calibration.covariance[calibration.layout.shape, calibration.layout.shape]),
+                0.0,
+            )
+        )
+        bent = bench.blend(np.ones(bench.problem.n_views, bool), replace(calibration, shape=calibration.shape + bend))
         change = bent.temperature_K - whole.temperature_K
         squares += np.nan_to_num(change - np.nanmedian(change)) ** 2
     return np.sqrt(squares)
@@ -145,7 +151,7 @@ def _completed(error: Float, own: Float, count: NDArray) -> Float:
     return out
 
 
-def _halves(bench: Bench, calibration: CrosscalResult | None, arc: int, shift: int) -> Halves:
+def _halves(bench: Bench, calibration: Calibration | None, arc: int, shift: int) -> Halves:
     """Arcs of views by turns in one half and the other, under one calibration."""
     masks = _by_turns(bench, arc, shift)
     a, b = (bench.blend(mask, calibration) for mask in masks)
@@ -155,14 +161,14 @@ def _halves(bench: Bench, calibration: CrosscalResult | None, arc: int, shift: i
 
 def _by_turns(bench: Bench, length: int, shift: int) -> tuple[Bool, Bool]:
     """Masks (N_views,) of groups of consecutive views by turns."""
-    views = bench.seen_views
-    in_A, in_B = np.zeros(bench.n_views, bool), np.zeros(bench.n_views, bool)
+    views = bench.problem.seen_views
+    in_A, in_B = np.zeros(bench.problem.n_views, bool), np.zeros(bench.problem.n_views, bool)
     turn = ((np.arange(len(views)) + shift) // length) % 2 == 0
     in_A[views[turn]], in_B[views[~turn]] = True, True
     return in_A, in_B
 
 
-def _calibration_error(bench: Bench, calibration: CrosscalResult, place_m: NDArray, k: int) -> Float:
+def _calibration_error(bench: Bench, calibration: Calibration, place_m: NDArray, k: int) -> Float:
     """(V,) K, what a calibration from other views and other skin would change, halved.
 
     Views alternate singly, in pairs or in threes: longer arcs would cut the chain of overlaps that the whole scan has.
@@ -189,7 +195,7 @@ def _point_spread(
     bench: Bench,
     dense: Bench,
     surface: SurfaceMesh,
-    calibration: CrosscalResult | None,
+    calibration: Calibration | None,
     masks: tuple[Bool, Bool],
     psf_sigma_px: float,
 ) -> Float:
@@ -199,19 +205,19 @@ def _point_spread(
     are spread alike and noisy independently, so that the product's mean has no noise in it.
     """
     sigma_m = _spread_m(bench, psf_sigma_px)
-    start, vertex, distance2 = _neighbours(surface, bench.vertices, float(np.nanmedian(sigma_m)))
+    start, vertex, distance2 = _neighbours(surface, bench.problem.vertices, float(np.nanmedian(sigma_m)))
     owner = np.repeat(np.arange(len(bench)), np.diff(start))
     kernel = np.exp(-0.5 * distance2 / sigma_m[owner] ** 2)
     effect = []
     for mask in masks:
         T = dense.blend(mask, calibration).temperature_K
-        effect.append(T[bench.vertices] - _weighted_mean(T[vertex], kernel, owner, len(bench)))
+        effect.append(T[bench.problem.vertices] - _weighted_mean(T[vertex], kernel, owner, len(bench)))
     product = effect[0] * effect[1]
     both = np.flatnonzero(np.isfinite(product))
     out = np.zeros(len(bench))
     if len(both) < NEIGHBOURS:
         return out
-    place = surface.vertices_m[bench.vertices]
+    place = surface.vertices_m[bench.problem.vertices]
     _, near = cKDTree(place[both]).query(place, k=NEIGHBOURS)
     return np.sqrt(np.maximum(product[both][near].mean(1), 0.0)) + out
 
@@ -225,7 +231,7 @@ def _weighted_mean(values: NDArray, weight: NDArray, owner: NDArray, n: int) -> 
 
 def _spread_m(bench: Bench, psf_sigma_px: float) -> Float:
     """(V,) m, sigma of the point spread on the surface: optics and bilinear sampling; 1/cosθ wider along the tilt."""
-    rows = bench.observations.select(bench.counts)
+    rows = bench.problem.observations.select(bench.problem.counts)
     vertex, cos = rows.vertex, rows.cos_angle.astype(np.float64)
     pixel_m2 = rows.footprint_m2 * cos
     area = pixel_m2 * 0.5 * (1 + 1 / cos**2)

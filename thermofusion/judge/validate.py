@@ -21,7 +21,7 @@ from ..files.whole import write_text
 from ..progress import Progress, silent
 from ..recipe import Recipe
 from ..robust import Statistics, mad_sigma
-from ..temperature.uncertainty import BILINEAR_VARIANCE, ErrorModel
+from ..temperature.uncertainty import BILINEAR_VARIANCE
 from ..types import Scan
 from .leftout import WELL_SEEN_DEG, Bench, LeftOut
 from .maperror import MapError, map_error
@@ -150,43 +150,48 @@ def validate_result(
 ) -> ValidationReport:
     """`validate` of a result that was run to its end."""
     assert result.surface is not None
-    assert result.seen is not None
+    assert result.mapped is not None
     assert result.temperature is not None
     assert scan.thermal is not None
-    surface, mesh, step = result.surface.mesh, result.temperature.mesh, progress
-    dense = Bench.of(scan, surface, result.seen, result.temperature, recipe)
+    mesh, step = result.temperature.mesh, progress
+    dense = Bench.of(scan, result.surface, result.mapped, result.temperature, recipe)
     bench = dense.sample(sample)
     left = bench.predictions(folds, step)
     notes: list[str] = []
-    psf_px = scan.thermal.camera.psf_sigma_px
-    if psf_px is None:
-        psf_px = ErrorModel.psf_sigma_px
+    psf_px = bench.problem.errors.psf_sigma_px
+    if scan.thermal.camera.psf_sigma_px is None:
         notes.append(f"the thermal camera's point spread is not known: {psf_px} px assumed")
     error = None
     step("half maps", 0, 1)
     try:
-        error = map_error(bench, dense, surface, mesh.uncertainty_K, psf_px)
+        error = map_error(bench, dense, mesh.surface, mesh.uncertainty_K, psf_px)
     except ScanError as fault:
         notes.append(f"the map's own error cannot be told from halves of the views: {fault.cause}")
     step("half maps", 1, 1)
-    report = _report(scan, bench, left, folds, error, tuple(notes))
+    report = _report(scan, bench, left, folds, error, tuple(notes), recipe.name)
     return _with_motion(scan, result, report, recipe, folds, step) if motion else report
 
 
 def _report(
-    scan: Scan, bench: Bench, left: LeftOut, folds: int, error: MapError | None, notes: tuple[str, ...]
+    scan: Scan,
+    bench: Bench,
+    left: LeftOut,
+    folds: int,
+    error: MapError | None,
+    notes: tuple[str, ...],
+    recipe: str,
 ) -> ValidationReport:
     bins = {
         f"{lo}-{hi}" if hi < 90 else f"{lo}+": (left.angle_deg >= lo) & (left.angle_deg < hi)
         for lo, hi in ANGLE_BINS_DEG
     }
-    noise_K = bench.errors.netd_K * float(np.sqrt(BILINEAR_VARIANCE))
+    noise_K = bench.problem.errors.netd_K * float(np.sqrt(BILINEAR_VARIANCE))
     robust = mad_sigma(left.residual_K[left.angle_deg < WELL_SEEN_DEG])
     return ValidationReport(
         scan=scan.name,
-        recipe=bench.recipe.name,
-        method=bench.recipe.radiometry.method,
-        folds=min(folds, len(bench.seen_views)),
+        recipe=recipe,
+        method=bench.problem.settings.method,
+        folds=min(folds, len(bench.problem.seen_views)),
         views=len(np.unique(left.view)),
         vertices=len(bench),
         overall=Statistics.of(left.residual_K, left.sigma_K),
@@ -203,23 +208,23 @@ def _with_motion(
 ) -> ValidationReport:
     """Left-out residual with every view's pose corrected by its outline, against `report`'s without."""
     from ..mapping.motion import view_corrections
-    from ..mapping.observe import SurfaceRays, observe
+    from ..mapping.observe import SurfaceRays, observe_views
     from ..physics.signal import SignalConverter
 
     assert result.surface is not None
-    assert result.seen is not None
+    assert result.rig is not None
+    assert result.mapped is not None
     assert result.temperature is not None
     assert scan.thermal is not None
-    surface, seen = result.surface.mesh, result.seen
-    motion = view_corrections(scan.thermal, surface, seen.views, result.alignment, progress=progress)
+    surface, mapped, camera = result.surface.mesh, result.mapped, result.rig.camera
+    motion = view_corrections(scan.thermal, surface, mapped.views, result.rig.outline_width_px, progress=progress)
     report = replace(report, messages=(*report.messages, *motion.messages))
     if not motion.kept:
         return report
-    views = replace(seen.views, T_world_thermal=motion.T_world_thermal)
-    rows = observe(
-        scan.thermal, SurfaceRays(surface), views, SignalConverter(scan.thermal.camera).radiance, recipe.mapping
-    )
-    bench = Bench.of(scan, surface, replace(seen, views=views, observations=rows), result.temperature, recipe)
+    views = replace(mapped.views, T_world_thermal=motion.T_world_thermal)
+    rows = observe_views(scan.thermal, SurfaceRays(surface), views, SignalConverter(camera), recipe.mapping)
+    moved = replace(mapped, views=views, observations=rows)
+    bench = Bench.of(scan, result.surface, moved, result.temperature, recipe)
     left = bench.sample(report.vertices).predictions(folds, progress)
     before, after = report.overall.rmse_K, Statistics.of(left.residual_K).rmse_K
     preferred = after < (1 - MOTION_GAIN) * before

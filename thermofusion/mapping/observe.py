@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import ScanError
 from ..geometry.camera import project, viewing_cosine
+from ..geometry.mesh import undirected_edges
 from ..geometry.rays import RayScene
 from ..geometry.rigid import invert, transform_points
 from ..physics.signal import SignalConverter
@@ -27,7 +28,6 @@ from ..types import (
     Camera,
     Float,
     Float32,
-    Int,
     Observations,
     Scan,
     SurfaceMesh,
@@ -50,7 +50,7 @@ class SurfaceRays:
         self.mesh = mesh
         self._scene = RayScene(mesh.vertices_m, mesh.triangles)
         self._lifted = mesh.vertices_m + np.float32(NORMAL_OFFSET_M) * mesh.normals
-        edges, self._on_boundary = _edges(mesh.triangles)
+        edges, self._on_boundary = undirected_edges(mesh.triangles)
         self._edge_a, self._edge_b = np.ascontiguousarray(edges[:, 0]), np.ascontiguousarray(edges[:, 1])
 
     def visible(self, vertices: NDArray, eye_m: NDArray, tolerance_m: float) -> Bool:
@@ -246,12 +246,3 @@ def _edge_distance(
     if not len(uv):
         return np.full(camera.shape, EDGE_CAP_PX, np.float32)
     return np.minimum(cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_5), EDGE_CAP_PX)
-
-
-def _edges(triangles: Int) -> tuple[Int, Bool]:
-    """Undirected edges (E, 2) of a mesh and whether each belongs to one triangle only."""
-    pairs = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
-    code = pairs[:, 0].astype(np.int64) << 32 | pairs[:, 1].astype(np.int64)
-    unique, count = np.unique(code, return_counts=True)
-    edges = np.stack([unique >> 32, unique & 0xFFFFFFFF], axis=1).astype(np.int32)
-    return edges, count == 1

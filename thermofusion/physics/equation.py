@@ -33,12 +33,12 @@ def apparent_radiance(
     L_air: ArrayLike = 0.0,
     offset: ArrayLike = 0.0,
 ) -> Float:
-    """What the camera reports: τ[L_r + ε(L_s - L_r)] + (1-τ) L_air + b, all W m-2 sr-1; arguments broadcast.
+    """What the camera reports: τ[ε L_s + (1-ε) L_r] + (1-τ) L_air + b, all W m-2 sr-1; arguments broadcast.
 
     With the normal-equivalent radiance in place of L_surface, epsilon is E(θ).
     """
-    L_r, tau = np.asarray(L_reflected), np.asarray(transmission)
-    leaving = L_r + excess_reading(np.asarray(L_surface) - L_r, epsilon, 0.0)
+    eps, tau = np.asarray(epsilon), np.asarray(transmission)
+    leaving = eps * np.asarray(L_surface) + (1 - eps) * np.asarray(L_reflected)
     return np.asarray(tau * leaving + (1 - tau) * np.asarray(L_air) + np.asarray(offset))
 
 

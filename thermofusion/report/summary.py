@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,67 +15,56 @@ from ..types import Scan, VertexFlag
 from ..version import __version__
 
 if TYPE_CHECKING:
-    from ..pipeline import Result
-    from ..rig.align import AlignmentResult
+    from ..mapping.observe import Mapped
+    from ..rig.align import RigResult
     from ..surface.surface import SurfaceResult
-    from ..temperature.solve import Seen, Temperature
+    from ..temperature.solve import Temperature
     from ..tracking.track import TrackingResult
 
 PERCENTILES = (1, 5, 50, 95, 99)
 
 
-def result_report(
-    scan: Scan,
-    recipe: Recipe,
-    tracking: TrackingResult,
-    surface: SurfaceResult | None,
-    alignment: AlignmentResult | None,
-    seen: Seen | None,
-    temperature: Temperature | None,
-    reused: Sequence[str],
-) -> dict[str, Any]:
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """What the steps of a run found; None: not needed, or not reached."""
+
+    tracking: TrackingResult
+    surface: SurfaceResult | None = None
+    rig: RigResult | None = None
+    mapped: Mapped | None = None
+    temperature: Temperature | None = None
+
+
+def result_report(scan: Scan, recipe: Recipe, steps: Steps, reused: Sequence[str]) -> dict[str, Any]:
     """The content of `result.json`; groups of stages that did not run are absent."""
     report: dict[str, Any] = {
         "thermofusion": __version__,
         "scan": _scan(scan),
         "recipe": recipe.name,
-        "tracking": _tracking(tracking),
+        "tracking": _tracking(steps.tracking),
     }
-    messages = [*scan.notes, *tracking.messages]
-    if surface is not None:
-        report["surface"] = _surface(surface)
-        messages += surface.messages
-    if alignment is not None:
-        report["alignment"] = _alignment(scan, alignment)
-        messages += alignment.messages
-    if seen is not None:
-        report["views"] = {
-            "used": len(seen.views),
-            "left_out": seen.left_out,
-            "observations": len(seen.observations),
-            "blackbody_readings": len(seen.blackbodies),
-        }
-        if seen.motion is not None:
-            m = seen.motion
-            kept = {
-                "kept": m.kept,
-                "residual_px_before": m.residual_px_before,
-                "residual_px_after": m.residual_px_after,
-            }
-            report["views"]["motion"] = {**kept, "correction_mm": m.correction_mm}
-            messages += m.messages
-    if temperature is not None:
-        report["temperature"] = _temperature(temperature)
-        messages += temperature.messages
-    report["quality"] = _quality(recipe, scan, tracking, temperature)
+    messages = [*scan.notes, *steps.tracking.messages]
+    if steps.surface is not None:
+        report["surface"] = _surface(steps.surface)
+        messages += steps.surface.messages
+    if steps.rig is not None:
+        report["rig"] = _rig(scan, steps.rig)
+        messages += steps.rig.messages
+    if steps.mapped is not None:
+        report["mapping"] = _mapping(steps.mapped)
+        messages += () if steps.mapped.motion is None else steps.mapped.motion.messages
+    if steps.temperature is not None:
+        report["temperature"] = _temperature(steps.temperature)
+        messages += steps.temperature.messages
+    report["quality"] = _quality(recipe, scan, steps.tracking, steps.temperature)
     report["messages"] = messages
     report["stages_reused"] = list(reused)
     return report
 
 
-def summary(result: Result, out: Path | None) -> str:
+def summary(report: Mapping[str, Any], out: Path | None) -> str:
     """A few lines for the terminal."""
-    r = result.report
+    r = report
     lines = []
     t = r["tracking"]
     lines.append(
@@ -85,15 +75,15 @@ def summary(result: Result, out: Path | None) -> str:
         lines.append(
             f"surface      {s['vertices']:,} vertices, voxel {s['voxel_mm']:.1f} mm, grid {s['memory_gib']:.2f} GiB"
         )
-    if "alignment" in r:
-        a = r["alignment"]
+    if "rig" in r:
+        a = r["rig"]
         if a["changed"]:
-            change = f"rig turned {a['rotation_deg']:.2f}°, clock {a['time_offset_s'] * 1e3:+.0f} ms"
+            change = f"turned {a['rotation_deg']:.2f}°, clock {a['time_offset_s'] * 1e3:+.0f} ms"
         else:
-            change = "rig left as it was"
-        lines.append(f"alignment    {change}; outline residual {_number(a['residual_px_after'])} px")
-    if "views" in r:
-        v = r["views"]
+            change = "left as it was"
+        lines.append(f"rig          {change}; outline residual {_number(a['residual_px_after'])} px")
+    if "mapping" in r:
+        v = r["mapping"]
         lines.append(f"mapping      {v['used']} thermal views, {v['observations']:,} observations")
     if "temperature" in r:
         t = r["temperature"]
@@ -145,14 +135,15 @@ def _surface(s: SurfaceResult) -> dict[str, Any]:
     }
 
 
-def _alignment(scan: Scan, a: AlignmentResult) -> dict[str, Any]:
-    start = None if scan.thermal is None else scan.thermal.camera.T_thermal_depth
+def _rig(scan: Scan, a: RigResult) -> dict[str, Any]:
+    T = a.camera.T_thermal_depth
+    start = T if scan.thermal is None else scan.thermal.camera.T_thermal_depth
     return {
         "changed": a.changed,
         "converged": a.converged,
-        "T_thermal_depth": a.T_thermal_depth,
-        "rotation_deg": 0.0 if start is None else float(rotation_angle_deg(a.T_thermal_depth @ invert(start))),
-        "time_offset_s": a.time_offset_s,
+        "T_thermal_depth": T,
+        "rotation_deg": float(rotation_angle_deg(T @ invert(start))),
+        "time_offset_s": a.camera.time_offset_s,
         "residual_px_before": a.residual_px_before,
         "residual_px_after": a.residual_px_after,
         "sigma_rotation_deg": a.sigma_rotation_deg,
@@ -160,6 +151,19 @@ def _alignment(scan: Scan, a: AlignmentResult) -> dict[str, Any]:
         "sigma_time_s": a.sigma_time_s,
         "views_used": a.views_used,
     }
+
+
+def _mapping(m: Mapped) -> dict[str, Any]:
+    out = {
+        "used": len(m.views),
+        "left_out": m.left_out,
+        "observations": len(m.observations),
+        "blackbody_readings": len(m.blackbodies),
+    }
+    if m.motion is None:
+        return out
+    motion = {k: getattr(m.motion, k) for k in ("kept", "residual_px_before", "residual_px_after", "correction_mm")}
+    return {**out, "motion": motion}
 
 
 def _temperature(t: Temperature) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,28 +11,24 @@ from ..errors import RecipeError, ScanError
 from ..files.json import to_json
 from ..files.whole import write_text
 from ..recipe import Recipe
+from ..report.summary import Steps
 from ..types import ThermalMesh, Trajectory
 from .artifacts import load_artifact, save_artifact
 
 if TYPE_CHECKING:
     from ..report.casts import Cast
-    from ..rig.align import AlignmentResult
-    from ..surface.surface import SurfaceResult
-    from ..temperature.solve import Seen, Temperature
-    from ..tracking.track import TrackingResult
 
 
 @dataclass(frozen=True, eq=False)
-class Result:
-    """What `fuse` returns: the mesh, and how it came about. Stages that were not needed or not reached are None."""
+class Result(Steps):
+    """What `fuse` returns: what the steps found, and the report on it."""
 
-    report: dict[str, Any]
-    trajectory: Trajectory
-    tracking: TrackingResult | None = None
-    surface: SurfaceResult | None = None
-    alignment: AlignmentResult | None = None
-    seen: Seen | None = None
-    temperature: Temperature | None = None
+    report: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Poses of the depth camera."""
+        return self.tracking.trajectory
 
     @property
     def mesh(self) -> ThermalMesh:
@@ -63,10 +59,13 @@ def write_result(result: Result, recipe: Recipe, folder: Path, casts: Future[lis
 
 
 def load_mesh(folder: Path, show: str = "absolute") -> ThermalMesh:
-    """The mesh of a finished result, in one of the three output modes."""
+    """The mesh of a finished result, in one of the three output modes. Raises ScanError."""
+    from ..temperature.solve import Temperature
+
     path = folder / "result.npz"
-    try:
-        temperature = load_artifact(path)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as e:
-        raise ScanError(f"no finished result is here ({e})", place=path, hint="run `thermofusion run` first") from None
+    if not path.is_file():
+        raise ScanError("no finished result is here", place=folder, hint="run `thermofusion run` first")
+    temperature = load_artifact(path)
+    if not isinstance(temperature, Temperature):
+        raise ScanError("it holds no temperatures", place=path, hint="run `thermofusion run` again")
     return temperature.shown(show)

@@ -1,7 +1,8 @@
-"""The result folder: files that appear whole or not at all, and stages that are not computed twice.
+"""Stages that are not computed twice.
 
-A stage's key is the hash of everything that goes into it: the scan's fingerprint, the recipe sections it reads, the
-program's version, and the key of the stage before. A stored artifact with the same key is taken as it is.
+A stage's key is the hash of everything that goes into it: the scan's fingerprint, the recipe sections it reads (the same
+that it is handed), the edition of its code, and the key of the stage before. A stored artifact with the same key is
+taken as it is. Artifact and key are one file.
 """
 
 from __future__ import annotations
@@ -9,20 +10,44 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
-from ..files.json import _plain, to_json
-from ..files.whole import write_text
+from ..errors import ScanError
+from ..files.json import plain
+from ..progress import Progress
+from ..recipe import Recipe
 from ..types import Scan
-from .artifacts import load_artifact, save_artifact
+from .artifacts import load_artifact, load_note, save_artifact
 
-T = TypeVar("T")
+T = TypeVar("T", covariant=True)
 WORK = "stages"  # sub-folder of a result that holds the artifacts
+# What version 0.1.0 left there under other names.
+STALE = (
+    "track.json",
+    "surface.json",
+    "align.json",
+    "observe.json",
+    "temperature.json",
+    "track.npz",
+    "align.npz",
+    "observe.npz",
+)
 
 
-# ---------------------------------------------------------------- stages
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """A step of the method. reads : the recipe sections that it is handed, and that its key holds. edition : raised when
+    the numbers that its code makes change."""
+
+    name: str
+    reads: tuple[str, ...]
+    edition: int = 1
+
+    def sections(self, recipe: Recipe) -> dict[str, Any]:
+        """What the stage reads of a recipe, by name."""
+        return {name: getattr(recipe, name) for name in self.reads}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,63 +59,73 @@ class StagePlan:
     why: str
 
 
-class Stages:
-    """Runs named stages in order and remembers their results in a folder (or not at all, without a folder)."""
+class Computes(Protocol[T]):
+    """A stage's function: recipe sections by name, and progress."""
 
-    def __init__(
-        self, folder: Path | None, base: Mapping[str, Any], *, redo_from: str | None = None, order: tuple[str, ...] = ()
-    ) -> None:
+    def __call__(self, *, progress: Progress, **sections: Any) -> T: ...
+
+
+class Stages:
+    """Runs stages in order and remembers their results in a folder (or not at all, without a folder)."""
+
+    def __init__(self, folder: Path | None, base: Mapping[str, Any], recipe: Recipe) -> None:
         self._folder = None if folder is None else folder / WORK
-        self._key = _hash(base)
-        self._base = dict(base)
-        self._redo = frozenset(order[order.index(redo_from) :]) if redo_from else frozenset()
+        self._base, self._recipe = dict(base), recipe
+        self.key = _hash(base)
         self.reused: list[str] = []
 
-    def run(self, name: str, inputs: Mapping[str, Any], compute: Callable[[], T]) -> T:
-        """The stage's result: stored, if its key still fits; else computed, and stored."""
-        plan, artifact = self._advance(name, inputs)
+    def run(self, stage: Stage, compute: Computes[T], progress: Progress, *, anew: bool = False) -> T:
+        """The stage's result: stored, if its key still fits; else computed, and stored. anew : whatever is stored."""
+        plan, inputs = self.plan(stage, anew=anew), self._inputs(stage)
+        artifact = None if self._folder is None else self._folder / f"{stage.name}.npz"
         if plan.reuse and artifact is not None:
             try:
                 value = load_artifact(artifact)
-                self.reused.append(name)
+                self.reused.append(stage.name)
                 return value
-            except (OSError, ValueError, KeyError, TypeError, AttributeError):
-                pass  # torn or written by another version: compute again
-        value = compute()
+            except ScanError:
+                pass  # damaged since its key was read: compute again
+        value = compute(**stage.sections(self._recipe), progress=progress)
         if artifact is not None:
-            save_artifact(artifact, value)
-            write_text(artifact.with_suffix(".json"), json.dumps({"key": self._key, "inputs": self._stored(inputs)}))
+            save_artifact(artifact, value, {"key": self.key, "inputs": inputs})
         return value
 
-    def plan(self, name: str, inputs: Mapping[str, Any]) -> StagePlan:
-        """What `run` would do, without doing it."""
-        return self._advance(name, inputs)[0]
-
-    def _stored(self, inputs: Mapping[str, Any]) -> dict[str, Any]:
-        return json.loads(to_json({**self._base, **_flat(_plain(inputs))}))
-
-    def _advance(self, name: str, inputs: Mapping[str, Any]) -> tuple[StagePlan, Path | None]:
-        self._key = _hash({"before": self._key, "stage": name, "inputs": _plain(inputs)})
+    def plan(self, stage: Stage, *, anew: bool = False) -> StagePlan:
+        """What `run` would do, without doing it; the next stage's key goes on from here."""
+        sections = plain(stage.sections(self._recipe))
+        self.key = _hash({"before": self.key, "stage": stage.name, "edition": stage.edition, "inputs": sections})
         if self._folder is None:
-            return StagePlan(name, False, "nothing is stored"), None
-        artifact = self._folder / f"{name}.npz"
-        if name in self._redo:
-            return StagePlan(name, False, "asked for"), artifact
+            return StagePlan(stage.name, False, "nothing is stored")
+        if anew:
+            return StagePlan(stage.name, False, "asked for")
+        artifact = self._folder / f"{stage.name}.npz"
+        if not artifact.is_file():
+            return StagePlan(stage.name, False, "not computed yet")
         try:
-            note = json.loads(artifact.with_suffix(".json").read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            return StagePlan(name, False, "not computed yet"), artifact
-        if note.get("key") == self._key and artifact.is_file():
-            return StagePlan(name, True, "inputs unchanged"), artifact
-        now, then = self._stored(inputs), note.get("inputs", {})
+            note = load_note(artifact)
+        except ScanError:
+            return StagePlan(stage.name, False, "what is stored cannot be read")
+        if note.get("key") == self.key:
+            return StagePlan(stage.name, True, "inputs unchanged")
+        now, then = self._inputs(stage), note.get("inputs", {})
         changed = sorted(k for k in now.keys() | then.keys() if now.get(k) != then.get(k))
-        why = f"changed: {', '.join(changed)}" if changed else "an earlier stage changed"
-        return StagePlan(name, False, why), artifact
+        return StagePlan(stage.name, False, f"changed: {', '.join(changed)}" if changed else "an earlier stage changed")
+
+    def tidy(self) -> None:
+        """Remove what an earlier version stored under other names."""
+        if self._folder is not None:
+            for name in STALE:
+                (self._folder / name).unlink(missing_ok=True)
+
+    def _inputs(self, stage: Stage) -> dict[str, Any]:
+        inputs = {**self._base, "edition": stage.edition, **_flat(plain(stage.sections(self._recipe)))}
+        return json.loads(json.dumps(inputs))
 
 
 def fingerprint(scan: Scan) -> str:
     """Hash of all that a scan says and of its files' names, sizes and times (their bytes are not read)."""
     h = hashlib.sha256()
+    streams = ("depth", "color", "thermal")
     for stream in (scan.depth, scan.color, scan.thermal):
         if stream is None:
             continue
@@ -98,20 +133,17 @@ def fingerprint(scan: Scan) -> str:
         for place in stream.places:
             try:
                 stat = Path(place).stat()
-                h.update(f"{place} {stat.st_size} {stat.st_mtime_ns};".encode())
+                h.update(f"{place} {stat.st_size} {stat.st_mtime_ns};".encode("utf-8", "surrogateescape"))
             except OSError:
-                h.update(place.encode())
-    rest = {
-        f.name: getattr(scan, f.name)
-        for f in dataclasses.fields(scan)
-        if f.name not in ("depth", "color", "thermal", "root")
-    }
+                h.update(place.encode("utf-8", "surrogateescape"))
+    rest = {f.name: getattr(scan, f.name) for f in dataclasses.fields(scan) if f.name not in (*streams, "root")}
+    rest["thermal camera"] = None if scan.thermal is None else scan.thermal.camera
     h.update(_hash(rest).encode())
     return h.hexdigest()[:24]
 
 
 def _hash(value: object) -> str:
-    return hashlib.sha256(json.dumps(_plain(value), sort_keys=True, default=str).encode()).hexdigest()[:24]
+    return hashlib.sha256(json.dumps(plain(value), sort_keys=True, default=str).encode()).hexdigest()[:24]
 
 
 def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

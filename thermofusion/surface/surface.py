@@ -14,7 +14,7 @@ from ..geometry.mesh import canonical, close_pinholes, smooth_positions
 from ..geometry.normals import window_normals
 from ..geometry.rigid import interpolate_trajectory
 from ..progress import Progress, silent
-from ..recipe import SurfaceSection, InputSection, SubjectSection
+from ..recipe import InputSection, SubjectSection, SurfaceSection
 from ..types import Float, Float32, Int, Scan, SurfaceMesh, Trajectory
 from .clean import RemovedPart, subject_only
 from .color import color_vertices

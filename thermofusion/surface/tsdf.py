@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..errors import ResourceError, ScanError
 from ..geometry.rigid import invert
 from ..progress import Progress, silent
-from ..recipe import SurfaceSection, InputSection
+from ..recipe import InputSection, SurfaceSection
 from ..robust import SIGMA_PER_MAD
 from ..types import Camera, Float, Float32, Scan
 

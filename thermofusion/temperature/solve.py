@@ -51,19 +51,22 @@ class Temperature:
     methods: dict[str, Any] = field(default_factory=dict)
     messages: tuple[str, ...] = ()
 
-    def shown(self, mode: OutputMode) -> ThermalMesh:
+    def shown(self, mode: str) -> ThermalMesh:
         """The mesh in another output mode. The uncertainty is the run's own mode's; for others it is unknown (NaN)."""
         if mode == self.mesh.mode:
             return self.mesh
-        values = {
+        values: dict[OutputMode, Float32] = {
             "absolute": self.absolute_degC,
             "normal-equivalent": self.normal_equivalent_degC,
             "apparent": self.apparent_degC,
         }
-        if mode not in values:
+        chosen = next((m for m in values if m == mode), None)
+        if chosen is None:
             raise RecipeError(f"there is no output mode '{mode}'", hint=f"choose from {', '.join(values)}")
         unknown = np.full(len(self.mesh), np.nan, np.float32)
-        return replace(self.mesh, temperature_degC=values[mode], mode=mode, uncertainty_K=unknown, uncertainty_parts={})
+        return replace(
+            self.mesh, temperature_degC=values[chosen], mode=chosen, uncertainty_K=unknown, uncertainty_parts={}
+        )
 
 
 def solve(

@@ -1,0 +1,88 @@
+"""The nouns that result files store, each under a name and version of its own: no file says which code to call."""
+
+from __future__ import annotations
+
+from functools import cache
+from types import MappingProxyType
+
+from ..errors import ScanError
+
+# Names under which version 0.1.0 of the program stored what `result.npz` holds.
+OLD_NAMES = MappingProxyType(
+    {
+        "thermofusion.crosscal:CrosscalResult": "calibration/1",
+        "thermofusion.imagefield:ImageField": "image-field/1",
+        "thermofusion.thermometry:Temperature": "temperature/1",
+        "thermofusion.types:SurfaceMesh": "surface-mesh/1",
+        "thermofusion.types:ThermalMesh": "thermal-mesh/1",
+    }
+)
+
+
+@cache
+def stored() -> MappingProxyType[str, type]:
+    """Name and version -> class. A class whose fields change gets a new version; the old one stays, with its reader."""
+    from ..mapping.motion import MotionResult
+    from ..mapping.observe import Mapped
+    from ..mapping.references import BlackbodyReading
+    from ..rig.align import RigResult
+    from ..surface.clean import RemovedPart
+    from ..surface.surface import SurfaceResult
+    from ..temperature.crosscal import Calibration
+    from ..temperature.field import ImageField
+    from ..temperature.solve import Temperature
+    from ..tracking.track import LostRange, TrackingResult
+    from ..types import (
+        Camera,
+        Observations,
+        SignalCurve,
+        SurfaceMesh,
+        ThermalCamera,
+        ThermalMesh,
+        ThermalViews,
+        Trajectory,
+    )
+
+    return MappingProxyType(
+        {
+            "blackbody-reading/1": BlackbodyReading,
+            "calibration/1": Calibration,
+            "camera/1": Camera,
+            "image-field/1": ImageField,
+            "lost-range/1": LostRange,
+            "mapped/1": Mapped,
+            "motion/1": MotionResult,
+            "observations/1": Observations,
+            "removed-part/1": RemovedPart,
+            "rig/1": RigResult,
+            "signal-curve/1": SignalCurve,
+            "surface-mesh/1": SurfaceMesh,
+            "surface/1": SurfaceResult,
+            "temperature/1": Temperature,
+            "thermal-camera/1": ThermalCamera,
+            "thermal-mesh/1": ThermalMesh,
+            "thermal-views/1": ThermalViews,
+            "tracking/1": TrackingResult,
+            "trajectory/1": Trajectory,
+        }
+    )
+
+
+def name_of(value: object) -> str:
+    """The name under which an object is stored. Raises TypeError for what is no stored noun."""
+    for name, cls in stored().items():
+        if type(value) is cls:
+            return name
+    raise TypeError(f"{type(value).__name__} is no noun that results store")
+
+
+def class_of(name: object) -> type:
+    """The class of a stored name, today's or an old one. Raises ScanError for an unknown or a newer one."""
+    cls = stored().get(OLD_NAMES.get(str(name), str(name)))
+    if cls is None:
+        shown = ascii(str(name)[:60])
+        raise ScanError(
+            f"it holds {shown}, which this version of thermofusion does not know",
+            hint="run the scan again, or read the result with the version that wrote it",
+        )
+    return cls
