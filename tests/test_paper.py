@@ -6,6 +6,7 @@ import csv
 import json
 import xml.etree.ElementTree as ET
 from dataclasses import replace
+from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
 
 import numpy as np
@@ -13,9 +14,9 @@ import pytest
 from conftest import ROOT
 
 from thermofusion.errors import RecipeError, ScanError
-from thermofusion.paper import cylinder, reproduce, steps
+from thermofusion.paper import cylinder, laboratory, reproduce, steps
 from thermofusion.paper.cylinder import BAND, ROOM_DEGC, ROWS, SHAPE, Profile, Uniformity, fit_outline
-from thermofusion.paper.report import Number, PaperReport, Writer
+from thermofusion.paper.report import Figure, Number, PaperReport
 from thermofusion.paper.sideview import ByAngle, Compared
 from thermofusion.physics.emissivity import Fresnel
 from thermofusion.report.plot import Axis, Band, Line, Picture, Plot, Points, Polar, csv_text, page
@@ -75,7 +76,7 @@ def test_a_bar_is_met_or_not(low, high, met):
 
 
 def test_a_missed_bar_is_listed_and_a_number_that_is_none_misses(tmp_path):
-    figure = Writer(tmp_path, "fig0").report("t", [Number("x", float("nan"), "", None, 0, 1), Number("y", 0.5)])
+    figure = Figure("fig0", "t", numbers=[Number("x", float("nan"), "", None, 0, 1), Number("y", 0.5)]).write(tmp_path)
     report = PaperReport((figure,))
     assert report.failed == ("fig0: x",)
     report.write(tmp_path)
@@ -116,6 +117,12 @@ def test_an_unknown_figure_is_refused(tmp_path):
     with pytest.raises(RecipeError, match="there is no figure 'fig99'"):
         reproduce(None, tmp_path, ["fig99"])
     assert {"fig7", "fig8", "fig9", "fig11", "fig16"} <= {name for s in steps() for name in s.figures}
+
+
+@pytest.mark.parametrize("step", steps(), ids=lambda step: step.name)
+def test_every_step_names_a_function_that_is_there(step):
+    module, function = step.make.split(":")
+    assert callable(getattr(import_module(f"thermofusion.paper.{module}"), function))
 
 
 # ---------------------------------------------------------------- the cylinder, on made pictures
@@ -166,7 +173,7 @@ def test_reflection_measured_at_other_temperatures_is_taken_out():
 
 def test_frames_that_are_cut_short_are_refused(tmp_path):
     with pytest.raises(ScanError, match="cannot be read"):
-        cylinder.read_frame(tmp_path, 36)
+        laboratory.read_frame(tmp_path, 36)
 
 
 # ---------------------------------------------------------------- oblique against facing
@@ -204,7 +211,7 @@ def results_page():
 
 def test_results_page_is_built_from_json_and_names_a_bad_file(tmp_path):
     (tmp_path / "results").mkdir()
-    figure = Writer(tmp_path / "results", "fig0").report("title", [Number("x", 0.5, "K", "0.4", None, 1)])
+    figure = Figure("fig0", "title", numbers=[Number("x", 0.5, "K", "0.4", None, 1)]).write(tmp_path)
     PaperReport((figure,)).write(tmp_path / "results")
     table = {"title": "T", "columns": ["a", "b"], "rows": [["p|q", 0.12345]], "command": "c", "order": 1}
     (tmp_path / "results" / "t.json").write_text(json.dumps(table))

@@ -8,29 +8,17 @@ import numpy as np
 
 from ..files.shipped import data_dir
 from ..physics.band import Band
-from ..physics.emissivity import (
-    COSINE_EPSILON0,
-    HALE_QUERRY_1973,
-    Cosine,
-    EmissivityModel,
-    Fresnel,
-    fresnel_reflectivity,
-    water,
-)
-from ..report.plot import BLUE, DASHED, GREEN, INK, ORANGE, PURPLE, Axis, Line, Plot, Points, Polar, page
+from ..physics.emissivity import COSINE_EPSILON0, HALE_QUERRY_1973, Fresnel, fresnel_reflectivity, water
+from ..report.plot import DASHED, GREEN, INK, Axis, Line, Plot, Points, Polar
 from ..report.plot import Band as Area
 from ..types import Float
-from .report import FigureReport, Number, Writer
+from .models import SKIN, STYLE
+from .prepared import Prepared
+from .report import Figure, Number
 
 BAND = Band(7.5, 13.5)  # of the paper's camera
 NALLI = "nalli2022_water_nk_307_311.csv"
 PUBLISHED_WATER = Path("tables", "water_emissivity_vs_incidence.csv")
-SKIN: dict[str, EmissivityModel] = {
-    "dielectric": Fresnel(1.33),
-    "non-dielectric": Fresnel(1.33, 0.25),
-    "cosine": Cosine(),
-}
-STYLE = {"dielectric": (BLUE, ""), "non-dielectric": (ORANGE, DASHED), "cosine": (PURPLE, "2 3")}
 LABEL = {
     "dielectric": "dielectric, n = 1.33",
     "non-dielectric": "non-dielectric, 1.33 + 0.25i",
@@ -40,7 +28,7 @@ EPSILON0_STATED = (0.97, 0.99)  # the paper's 0.98 ± 0.01
 
 
 def nalli_water(T_K: int) -> tuple[Float, Float, Float]:
-    """Wavelength [µm], n, k of water at 307 or 311 K inside 7.5-13.5 µm (Nalli et al. 2022), by rising wavelength."""
+    """Wavelength [µm], n, k, each (N,), of water at 307 or 311 K inside 7.5-13.5 µm (Nalli et al. 2022), rising."""
     table = np.loadtxt(data_dir() / "tables" / NALLI, delimiter=",", comments="#")
     wavelength_um, column = 1e4 / table[:, 0], {307: 1, 311: 3}[T_K]
     inside = np.flatnonzero((wavelength_um >= BAND.lo_um) & (wavelength_um <= BAND.hi_um))[::-1]
@@ -48,12 +36,15 @@ def nalli_water(T_K: int) -> tuple[Float, Float, Float]:
 
 
 def spectral_emissivity(cos_theta: Float, n: Float, k: Float) -> Float:
-    """ε (wavelengths, angles) of water at each tabulated wavelength (paper section 2.6.3)."""
+    """ε (W, A), dimensionless, of water at each tabulated wavelength (paper section 2.6.3).
+
+    cos_theta : (A,) cosine of the viewing angle. n, k : (W,) complex index n + ik.
+    """
     r_s, r_p = fresnel_reflectivity(cos_theta[None], (n + 1j * k)[:, None])
     return np.asarray(1 - 0.5 * (r_s + r_p))
 
 
-def figure7(out: Path, data: Path | None = None) -> FigureReport:
+def figure7(prepared: Prepared) -> list[Figure]:
     """Polar and Cartesian plots of the three models over the band of water's curves; Table 1's own ε(0)."""
     theta = np.linspace(0, 90, 361)
     theta[-1] = 89.999
@@ -63,39 +54,40 @@ def figure7(out: Path, data: Path | None = None) -> FigureReport:
     hale = spectral_emissivity(cos, n25, k25)
     nalli = {T: spectral_emissivity(cos, *nalli_water(T)[1:]) for T in (307, 311)}
     mean = water(BAND)(cos)
-    published = _published(data)
+    published = _published(prepared.data)
+    columns = {"theta_deg": theta, **{m.replace("-", "_"): y for m, y in models.items()}}
+    columns |= {"water_mean_306K": mean, "water_hale_querry_min": hale.min(0), "water_hale_querry_max": hale.max(0)}
+    for T, e in nalli.items():
+        columns |= {f"water_{T}K_min": e.min(0), f"water_{T}K_max": e.max(0)}
 
     curves = [Line(theta, y, STYLE[m][0], LABEL[m], STYLE[m][1]) for m, y in models.items()]
     green = Area(theta, hale.min(0), hale.max(0), GREEN, "water, 7.5-13.5 µm, each wavelength")
     white = Line(theta, mean, GREEN, "water, band mean (306 K)", width=1.5)
     extra = [] if published is None else [Points(*published, INK, "water, published table", radius=2.4, hollow=True)]
-    close = [Line(theta, nalli[T].min(0), GREEN, dash=d, width=1) for T, d in ((307, "4 2"), (311, "1 2"))]
-    close += [Line(theta, nalli[T].max(0), GREEN, dash=d, width=1) for T, d in ((307, "4 2"), (311, "1 2"))]
-    x, unit = Axis("viewing angle θ [°]", 0, 90, 15), Axis("emissivity ε(θ)", 0, 1, 0.2)
-    near = Axis("emissivity ε(θ)", 0.8, 1.0, 0.05)
-    writer = Writer(out, "fig7")
-    writer.svg(
-        page(
-            [
-                Polar("(a) polar", Axis("ε(θ)", 0, 1, 0.25), [green, *curves]),
-                Plot("(b) Cartesian", x, unit, [green, white, *curves, *extra], "sw"),
-                Plot(
-                    "the same, enlarged", Axis(x.label, 0, 75, 15), near, [green, white, *curves, *close, *extra], "sw"
-                ),
-                Plot("reflectivity 1 − ε at 60° over the band", *_over_wavelength()),
-            ],
-            title="Fig. 7  Directional emissivity of skin",
-            caption="Water: Hale & Querry 1973 (25 °C, green area); Nalli et al. 2022 at 307 K (dashed) and 311 K "
+    dashes = {307: "4 2", 311: "1 2"}
+    close = [Line(theta, nalli[T].min(0), GREEN, dash=dash, width=1) for T, dash in dashes.items()]
+    close += [Line(theta, nalli[T].max(0), GREEN, dash=dash, width=1) for T, dash in dashes.items()]
+    x, near = Axis("viewing angle θ [°]", 0, 90, 15), Axis("viewing angle θ [°]", 0, 75, 15)
+    unit, top = Axis("emissivity ε(θ)", 0, 1, 0.2), Axis("emissivity ε(θ)", 0.8, 1.0, 0.05)
+    panels: list[Polar | Plot] = [
+        Polar("(a) polar", Axis("ε(θ)", 0, 1, 0.25), [green, *curves]),
+        Plot("(b) Cartesian", x, unit, [green, white, *curves, *extra], "sw"),
+        Plot("the same, enlarged", near, top, [green, white, *curves, *close, *extra], "sw"),
+        Plot("reflectivity 1 − ε at 60° over the band", *_over_wavelength()),
+    ]
+    return [
+        Figure(
+            "fig7",
+            "Directional emissivity of skin, Table 1",
+            panels,
+            {"": columns, "-table1": _table1()},
+            _numbers(published),
+            _NOTES,
+            "Fig. 7  Directional emissivity of skin",
+            "Water: Hale & Querry 1973 (25 °C, green area); Nalli et al. 2022 at 307 K (dashed) and 311 K "
             "(dotted) from 7.94 µm on.",
         )
-    )
-    columns = {"theta_deg": theta, **{m.replace("-", "_"): y for m, y in models.items()}}
-    columns |= {"water_mean_306K": mean, "water_hale_querry_min": hale.min(0), "water_hale_querry_max": hale.max(0)}
-    for T, e in nalli.items():
-        columns |= {f"water_{T}K_min": e.min(0), f"water_{T}K_max": e.max(0)}
-    writer.csv(columns)
-    writer.csv(_table1(), "-table1")
-    return writer.report("Directional emissivity of skin, Table 1", _numbers(published), _NOTES)
+    ]
 
 
 _NOTES = (
@@ -140,27 +132,19 @@ def _numbers(published: tuple[Float, Float] | None) -> list[Number]:
     low, high = EPSILON0_STATED
     cos60 = np.cos(np.radians(np.linspace(0, 60, 61)))
     wet = water(BAND)(cos60)
+    at60 = {name: float(model(0.5)) for name, model in SKIN.items()}
     numbers = [
         Number("ε(0) dielectric, n = 1.33", SKIN["dielectric"].normal, "", "0.98 ± 0.01", low, high),
         # no bar: that it lies outside the paper's range is the finding
         Number("ε(0) non-dielectric, 1.33 + 0.25i", SKIN["non-dielectric"].normal, "", "0.98 ± 0.01"),
-        Number(
-            "ε(60°) dielectric (golden value 0.94087440)", float(SKIN["dielectric"](0.5)), "", None, 0.940874, 0.940875
-        ),
-        Number(
-            "ε(60°) non-dielectric (golden 0.91732224)",
-            float(SKIN["non-dielectric"](0.5)),
-            "",
-            None,
-            0.917322,
-            0.917323,
-        ),
+        Number("ε(60°) dielectric (golden value 0.94087440)", at60["dielectric"], "", None, 0.940874, 0.940875),
+        Number("ε(60°) non-dielectric (golden 0.91732224)", at60["non-dielectric"], "", None, 0.917322, 0.917323),
         Number("ε(60°) water, band mean (golden 0.95016)", float(water(BAND)(0.5)), "", None, 0.95015, 0.95017),
     ]
-    agrees = {"dielectric": "agrees well with water", "non-dielectric": "agrees well with water", "cosine": "differs"}
     for name, model in SKIN.items():
         worst = float(np.abs(model(cos60) - wet).max())
-        numbers.append(Number(f"largest |ε − ε water| up to 60°, {name}", worst, "", agrees[name]))
+        said = "differs" if name == "cosine" else "agrees well with water"
+        numbers.append(Number(f"largest |ε − ε water| up to 60°, {name}", worst, "", said))
     if published is not None:
         theta, e = published
         off = float(np.abs(water(BAND)(np.cos(np.radians(theta))) - e).max())

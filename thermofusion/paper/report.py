@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from ..files.json import to_json
 from ..files.whole import write_text
-from ..report.plot import csv_text
+from ..report.plot import Panel, csv_text, page
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,11 @@ class Number:
             return f"{self.low:g} to {self.high:g}"
         return f"≤ {self.high:g}" if self.high is not None else f"≥ {self.low:g}" if self.low is not None else ""
 
+    def document(self) -> dict[str, object]:
+        """For JSON."""
+        ours, bar = float(f"{self.ours:.6g}"), self.bar or None
+        return {"what": self.what, "unit": self.unit, "paper": self.paper, "ours": ours, "bar": bar, "met": self.met}
+
 
 @dataclass(frozen=True)
 class FigureReport:
@@ -52,8 +57,8 @@ class FigureReport:
     name: str
     title: str
     files: tuple[str, ...]
-    numbers: tuple[Number, ...] = ()
     notes: tuple[str, ...] = ()
+    numbers: tuple[Number, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -71,30 +76,8 @@ class PaperReport:
 
     def document(self) -> dict[str, object]:
         """For JSON: deterministic, without times."""
-        return {
-            "figures": [
-                {
-                    "name": f.name,
-                    "title": f.title,
-                    "files": f.files,
-                    "notes": f.notes,
-                    "numbers": [
-                        {
-                            "what": n.what,
-                            "unit": n.unit,
-                            "paper": n.paper,
-                            "ours": float(f"{n.ours:.6g}"),
-                            "bar": n.bar or None,
-                            "met": n.met,
-                        }
-                        for n in f.numbers
-                    ],
-                }
-                for f in self.figures
-            ],
-            "skipped": self.skipped,
-            "failed": self.failed,
-        }
+        figures = [{**vars(f), "numbers": [n.document() for n in f.numbers]} for f in self.figures]
+        return {"figures": figures, "skipped": self.skipped, "failed": self.failed}
 
     def text(self) -> str:
         """A table for the terminal."""
@@ -126,28 +109,37 @@ class PaperReport:
         return _PAGE.replace("@VERDICT@", verdict).replace("@BODY@", body)
 
 
-class Writer:
-    """Writes a figure's files into a folder and remembers their names."""
+@dataclass(frozen=True, eq=False)
+class Figure:
+    """A figure before it is written.
 
-    def __init__(self, folder: Path, stem: str) -> None:
-        self.folder, self.stem = folder, stem
-        self.files: list[str] = []
+    name : stem of its files. title : in the report. panels : the picture, none = a table only; `columns` of them beside
+    each other, each of panel_px (width, height), between heading and caption. tables : what is added to the name of a
+    CSV file -> its columns, each (N,).
+    """
 
-    def svg(self, text: str, suffix: str = "") -> None:
-        """Write STEM[SUFFIX].svg."""
-        self._write(f"{self.stem}{suffix}.svg", text)
+    name: str
+    title: str
+    panels: Sequence[Panel] = ()
+    tables: Mapping[str, Mapping[str, ArrayLike]] = field(default_factory=dict)
+    numbers: Sequence[Number] = ()
+    notes: Sequence[str] = ()
+    heading: str = ""
+    caption: str = ""
+    columns: int = 2
+    panel_px: tuple[float, float] = (470.0, 360.0)
 
-    def csv(self, columns: Mapping[str, ArrayLike], suffix: str = "") -> None:
-        """Write STEM[SUFFIX].csv."""
-        self._write(f"{self.stem}{suffix}.csv", csv_text(columns))
-
-    def report(self, title: str, numbers: Sequence[Number] = (), notes: Sequence[str] = ()) -> FigureReport:
-        """The figure with the files written so far."""
-        return FigureReport(self.stem, title, tuple(self.files), tuple(numbers), tuple(notes))
-
-    def _write(self, name: str, text: str) -> None:
-        write_text(self.folder / name, text)
-        self.files.append(name)
+    def write(self, folder: Path) -> FigureReport:
+        """NAME.svg and the tables, each whole or not at all. Raises ResourceError."""
+        files = {}
+        if self.panels:
+            files[f"{self.name}.svg"] = page(
+                self.panels, title=self.heading, caption=self.caption, columns=self.columns, panel_px=self.panel_px
+            )
+        files |= {f"{self.name}{suffix}.csv": csv_text(table) for suffix, table in self.tables.items()}
+        for name, text in files.items():
+            write_text(folder / name, text)
+        return FigureReport(self.name, self.title, tuple(files), tuple(self.notes), tuple(self.numbers))
 
 
 def _section(f: FigureReport) -> str:

@@ -5,6 +5,7 @@ The paper could only look at its Fig. 16; several views of one surface answer it
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -13,27 +14,26 @@ from numpy.typing import NDArray
 
 from ..physics.band import ZERO_DEGC_K, Band
 from ..physics.emissivity import EmissivityModel, model_from_recipe
-from ..physics.equation import normal_equivalent, paper_chain
 from ..recipe import Recipe
 from ..robust import SIGMA_PER_MAD
 from ..types import Float, Observations, Scan
-from .emissivity_figures import SKIN
+from .models import SKIN, by_radiance_degC, eqs25_27_degC
 
 if TYPE_CHECKING:
     from ..pipeline import Result
 
+# Finer where ε(θ) falls fast
 BINS_DEG = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 55.0, 60.0, 65.0, 70.0, 75.0)
 FACING_DEG = 25.0  # the view that faces a spot sees it at less than this
 EDGE_PX = 4.0  # farther from silhouettes than this, so that only the angle differs
-MIN_PAIRS = 50  # in a bin, to say anything
-S_DEG = 10.0  # what is straight on for the paper's S
+MIN_PAIRS = 50  # in a bin, to say anything: their median is good to a fifth of the spread
 
 
 @dataclass(frozen=True, eq=False)
 class Compared:
     """Every observation by every method.
 
-    rows : the observations compared. angle_deg : (N,) by the ray. values_degC : method -> (N,). views : number of them.
+    rows : the observations compared. angle_deg : (N,) by the ray. values_degC : method -> (N,).
     """
 
     rows: Observations
@@ -41,7 +41,7 @@ class Compared:
     values_degC: dict[str, Float]
 
     def against_facing(self) -> tuple[NDArray[np.intp], dict[str, Float]]:
-        """(rows (M,) that see obliquely what another view faces, method -> their difference to that view (M,), K)."""
+        """(index (M,) of rows that see obliquely what another view faces, method -> difference to it (M,), K)."""
         rows = self.rows
         order = np.lexsort((self.angle_deg, rows.vertex))
         first = order[np.r_[True, np.diff(rows.vertex[order]) > 0]]
@@ -62,36 +62,28 @@ class ByAngle:
     spread_K: dict[str, Float]
 
     @classmethod
-    def of(cls, angle_deg: Float, differences_K: dict[str, Float], bins_deg: tuple[float, ...] = BINS_DEG) -> ByAngle:
-        """Bins with fewer than 50 pairs are NaN. Spread: 1.4826 x median absolute deviation."""
-        edges = np.asarray(bins_deg)
+    def of(cls, angle_deg: Float, differences_K: dict[str, Float]) -> ByAngle:
+        """From pairs at angle_deg (M,), and method -> differences_K (M,). Bins with fewer than 50 pairs are NaN.
+
+        Spread: 1.4826 x median absolute deviation.
+        """
+        edges = np.asarray(BINS_DEG)
         index = np.digitize(angle_deg, edges) - 1
         inside = [np.flatnonzero(index == i) for i in range(len(edges) - 1)]
-        count = np.array([len(i) for i in inside])
 
-        def per_bin(x: Float) -> tuple[Float, Float]:
-            median = np.array([np.median(x[i]) if len(i) >= MIN_PAIRS else np.nan for i in inside])
-            mad = [
-                np.median(np.abs(x[i] - m)) if len(i) >= MIN_PAIRS else np.nan
-                for i, m in zip(inside, median, strict=True)
-            ]
-            return median, SIGMA_PER_MAD * np.array(mad)
+        def medians(x: Float) -> Float:
+            return np.array([np.median(x[i]) if len(i) >= MIN_PAIRS else np.nan for i in inside])
 
-        both = {name: per_bin(x) for name, x in differences_K.items()}
-        return cls(
-            0.5 * (edges[1:] + edges[:-1]),
-            count,
-            {name: m for name, (m, _) in both.items()},
-            {name: s for name, (_, s) in both.items()},
-        )
+        row = np.clip(index, 0, len(inside) - 1)  # what lies outside is in no bin
+        median = {name: medians(x) for name, x in differences_K.items()}
+        spread = {name: SIGMA_PER_MAD * medians(np.abs(x - median[name][row])) for name, x in differences_K.items()}
+        return cls(0.5 * (edges[1:] + edges[:-1]), np.array([len(i) for i in inside]), median, spread)
 
 
-def compared(
-    result: Result, scan: Scan, recipe: Recipe, *, given: dict[str, EmissivityModel] | None = None
-) -> Compared:
+def compared(result: Result, scan: Scan, recipe: Recipe, models: Mapping[str, EmissivityModel] = SKIN) -> Compared:
     """A result's observations by every method, normal-equivalent throughout (what a facing camera would read).
 
-    given : the models of Eqs. 25-27 and of the radiance method, named as the paper's; its skin models by default.
+    models : of Eqs. 25-27 and of the radiance method, named as the paper's; the first one also by the camera's axis.
     Methods whose name begins with "joint" have the camera's offsets and field removed by the cross-calibration, and use
     the fitted ε(θ) and what the body itself adds to the reflection.
     """
@@ -100,7 +92,6 @@ def compared(
     assert scan.thermal is not None
     from ..temperature.solve import room_of
 
-    models = given or SKIN
     rows = result.seen.observations.select(result.seen.observations.edge_px >= EDGE_PX)
     band = Band(*scan.thermal.camera.band_um)
     room_K = room_of(scan.environment, recipe).reflected_K
@@ -110,29 +101,20 @@ def compared(
     L_room = float(band.radiance(room_K))
     values = {"uncorrected": apparent}
     for name, model in models.items():
-        values[f"Eqs. 25-27, {name}"] = _paper(apparent, cos, model, room_K)
-    first = next(iter(models))
+        values[f"Eqs. 25-27, {name}"] = eqs25_27_degC(apparent, cos, model, room_K - ZERO_DEGC_K)
+    name, model = next(iter(models.items()))
     axis = _axis_cosine(result, rows)
-    values[f"Eqs. 25-28 (axis), {first}"] = _paper(apparent, axis, models[first], room_K)
+    values[f"Eqs. 25-28 (axis), {name}"] = eqs25_27_degC(apparent, axis, model, room_K - ZERO_DEGC_K)
     for name, model in models.items():
         if name != "cosine":
-            L0 = normal_equivalent(L, model.relative(cos), L_room)
-            values[f"radiance, {name}"] = band.temperature_K(L0) - ZERO_DEGC_K
+            values[f"radiance, {name}"] = by_radiance_degC(L, cos, model, L_room, band)
     calibration = result.temperature.calibration
     if calibration is not None:
         L_camera = calibration.corrected(rows)
         values["offsets removed, uncorrected"] = band.temperature_K(L_camera) - ZERO_DEGC_K
         model = calibration.emissivity(model_from_recipe(recipe.emissivity, band))
-        L0 = normal_equivalent(L_camera, model.relative(cos), _reflected(result, rows, band, L_room))
-        values["joint"] = band.temperature_K(L0) - ZERO_DEGC_K
+        values["joint"] = by_radiance_degC(L_camera, cos, model, _reflected(result, rows, band, L_room), band)
     return Compared(rows, np.degrees(np.arccos(np.clip(cos, 0, 1))), values)
-
-
-def _paper(apparent_degC: Float, cos: Float, model: EmissivityModel, room_K: float) -> Float:
-    """Eqs. 25-27, one S for all views, from what faces the camera."""
-    corrected, _ = paper_chain(apparent_degC, model(cos), room_K - ZERO_DEGC_K)
-    facing = cos >= np.cos(np.radians(S_DEG))
-    return np.asarray(corrected * (np.median(apparent_degC[facing]) / np.median(corrected[facing])))
 
 
 def _axis_cosine(result: Result, rows: Observations) -> Float:

@@ -38,7 +38,7 @@ Corner = Literal["ne", "nw", "se", "sw"]
 
 @dataclass(frozen=True)
 class Axis:
-    """A linear axis from lo to hi with a tick every `step`."""
+    """A linear axis from lo to hi with a tick every `step`, all in the unit that the label gives."""
 
     label: str
     lo: float
@@ -60,7 +60,7 @@ class Axis:
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """A curve through (x, y); it breaks at NaN."""
+    """A curve through x, y, each (N,) in the axes' units; it breaks at NaN. width : px."""
 
     x: ArrayLike
     y: ArrayLike
@@ -72,7 +72,7 @@ class Line:
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """The area between two curves over x."""
+    """The area between two curves lo and hi over x, each (N,) in the axes' units."""
 
     x: ArrayLike
     lo: ArrayLike
@@ -84,7 +84,7 @@ class Band:
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Dots at (x, y), with optional symmetric error bars."""
+    """Dots at x, y, each (N,) in the axes' units, with optional symmetric error bars (N,). radius : px."""
 
     x: ArrayLike
     y: ArrayLike
@@ -119,7 +119,7 @@ class Plot:
     legend: Corner = "ne"
 
     def draw(self, width: float, height: float, key: str) -> str:
-        """SVG elements of the panel, its origin at the top left. key : unique on the page."""
+        """SVG elements of the panel, width by height px, its origin at the top left. key : unique on the page."""
         w, h = width - _LEFT - _RIGHT, height - _TOP - _BOTTOM
 
         def at(x: ArrayLike, y: ArrayLike) -> tuple[NDArray, NDArray]:
@@ -156,7 +156,7 @@ class Plot:
 
 @dataclass(frozen=True, eq=False)
 class Polar:
-    """A half disc: radius over the angle from the vertical, both sides alike (x of the marks in degrees)."""
+    """A half disc: radius over the angle from the vertical, both sides alike (x of the marks (N,) in degrees)."""
 
     title: str
     r: Axis
@@ -164,7 +164,7 @@ class Polar:
     angle_step_deg: float = 15.0
 
     def draw(self, width: float, height: float, key: str) -> str:
-        """SVG elements of the panel."""
+        """SVG elements of the panel, width by height px."""
         radius = min((width - 60) / 2, height - 110)
         cx, cy = width / 2, 58 + radius
 
@@ -210,7 +210,7 @@ class Bar:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """An image with a title, lines and points over it (in its pixels), and a colour bar."""
+    """An image, rgb (H, W, 3) sRGB, with a title, lines and points over it (in its pixels), and a colour bar."""
 
     title: str
     rgb: UInt8
@@ -218,7 +218,7 @@ class Picture:
     marks: Sequence[Line | Points] = ()
 
     def draw(self, width: float, height: float, key: str) -> str:
-        """SVG elements of the panel."""
+        """SVG elements of the panel, width by height px."""
         rows, columns = self.rgb.shape[:2]
         room = width - 24 - (_BAR_PX if self.bar else 0)
         scale = min(room / columns, (height - _TOP - 14) / rows)
@@ -246,7 +246,10 @@ def page(
     columns: int = 2,
     panel_px: tuple[float, float] = (470.0, 360.0),
 ) -> str:
-    """An SVG document with the panels in rows, a title above and a caption (broken at newlines) below."""
+    """An SVG document with the panels in rows, a title above and a caption (broken at newlines) below.
+
+    columns : panels beside each other. panel_px : width and height of each.
+    """
     pw, ph = panel_px
     columns = min(columns, len(panels))
     rows = -(-len(panels) // columns)
@@ -269,7 +272,10 @@ def page(
 
 
 def csv_text(columns: Mapping[str, ArrayLike], digits: int = 6) -> str:
-    """Columns of equal length as CSV with a head; NaN is an empty cell."""
+    """Columns, each (N,), as CSV with a head, numbers to so many digits; NaN is an empty cell.
+
+    Raises ValueError where they are not equally long.
+    """
     values = [np.asarray(v) for v in columns.values()]
     if len({len(v) for v in values}) > 1:
         raise ValueError("columns of a CSV file must be equally long")
