@@ -13,7 +13,8 @@ from thermofusion.errors import ScanError
 from thermofusion.geometry._open3d import o3d
 from thermofusion.geometry.rigid import invert, pose, se3_exp, se3_log
 from thermofusion.recipe import load_recipe
-from thermofusion.rig.align import PRIOR_TIME_S, AlignmentResult, align_thermal
+from thermofusion.rig.align import RigResult, align
+from thermofusion.rig.estimate import PRIOR_TIME_S
 from thermofusion.scans import open_scan
 from thermofusion.types import Scan, SurfaceMesh, Trajectory
 
@@ -31,16 +32,16 @@ def delayed(scan: Scan, seconds: float) -> Scan:
     return replace(scan, thermal=replace(scan.thermal, times_s=scan.thermal.times_s + seconds))
 
 
-def errors(result: AlignmentResult, truth: np.ndarray) -> tuple[float, float]:
+def errors(result: RigResult, truth: np.ndarray) -> tuple[float, float]:
     """Rotation [deg] and translation [m] from the truth."""
-    twist = se3_log(result.T_thermal_depth @ invert(truth))
+    twist = se3_log(result.camera.T_thermal_depth @ invert(truth))
     return float(np.degrees(np.linalg.norm(twist[:3]))), float(np.linalg.norm(twist[3:]))
 
 
-def inside_covariance(result: AlignmentResult, time_offset_s: float = 0.0) -> bool:
+def inside_covariance(result: RigResult, time_offset_s: float = 0.0) -> bool:
     """Whether the truth lies within 99.9 % of the stated covariance (chi-square with 7 degrees of freedom)."""
-    twist = se3_log(T_THERMAL_DEPTH @ invert(result.T_thermal_depth))
-    error = np.append(twist, time_offset_s - result.time_offset_s)
+    twist = se3_log(T_THERMAL_DEPTH @ invert(result.camera.T_thermal_depth))
+    error = np.append(twist, time_offset_s - result.camera.time_offset_s)
     return bool(error @ np.linalg.solve(result.covariance, error) < 24.3)
 
 
@@ -57,6 +58,10 @@ def scan(body) -> Scan:
 RECIPE = load_recipe({})
 
 
+def aligned(scan, body, trajectory, recipe=RECIPE):
+    return align(scan, body, trajectory, input=recipe.input, rig=recipe.rig)
+
+
 @pytest.mark.parametrize(
     ("rotation_deg", "translation_m", "clock_s"),
     [
@@ -67,13 +72,13 @@ RECIPE = load_recipe({})
 )
 def test_wrong_rig_and_clock_are_found(body, scan, rotation_deg, translation_m, clock_s):
     wrong = delayed(turned(scan, rotation_deg, translation_m), clock_s)
-    result = align_thermal(wrong, body, walk(), RECIPE)
+    result = aligned(wrong, body, walk())
     rotation, translation = errors(result, T_THERMAL_DEPTH)
     assert result.changed
     assert result.converged
     assert rotation < 0.1
     assert translation < 4e-3
-    assert result.time_offset_s == pytest.approx(-clock_s, abs=0.002)
+    assert result.camera.time_offset_s == pytest.approx(-clock_s, abs=0.002)
     assert result.residual_px_after < 0.2 * result.residual_px_before
     assert inside_covariance(result, -clock_s)
 
@@ -82,21 +87,21 @@ def test_wrong_rig_and_clock_are_found(body, scan, rotation_deg, translation_m, 
 def test_a_rig_off_by_degrees_is_searched_for(body, scan, rotation_deg):
     """Farther than edges are looked for. Said, so that the rig gets calibrated again."""
     wrong = delayed(turned(scan, rotation_deg, (0.003, 0.004, 0)), 0.05)
-    result = align_thermal(wrong, body, walk(), RECIPE)
+    result = aligned(wrong, body, walk())
     rotation, _ = errors(result, T_THERMAL_DEPTH)
     assert result.changed
     assert result.converged
     assert "calibrate it again" in result.messages[0]
     assert rotation < 0.1
-    assert abs(result.time_offset_s + 0.05) < 0.01
+    assert abs(result.camera.time_offset_s + 0.05) < 0.01
     assert inside_covariance(result, -0.05)
 
 
 def test_right_rig_is_left_alone(body, scan):
-    result = align_thermal(scan, body, walk(), RECIPE)
+    result = aligned(scan, body, walk())
     assert not result.changed
-    np.testing.assert_array_equal(result.T_thermal_depth, scan.thermal.camera.T_thermal_depth)
-    assert result.time_offset_s == 0
+    np.testing.assert_array_equal(result.camera.T_thermal_depth, scan.thermal.camera.T_thermal_depth)
+    assert result.camera.time_offset_s == 0
     assert "left alone" in result.messages[0]
     assert result.residual_px_before == pytest.approx(result.residual_px_after)
     assert result.residual_px_before < 0.3
@@ -105,23 +110,23 @@ def test_right_rig_is_left_alone(body, scan):
 def test_the_sensors_own_offset_is_the_start(body, scan):
     """A clock shift that scan.json already declares is none."""
     declared = with_camera(delayed(scan, 0.25), time_offset_s=-0.25)
-    result = align_thermal(declared, body, walk(), RECIPE)
+    result = aligned(declared, body, walk())
     assert not result.changed
-    assert result.time_offset_s == -0.25
+    assert result.camera.time_offset_s == -0.25
 
 
 def test_cold_body_in_a_warm_room(body, scan):
     cold = repainted(scan, lambda image: 2 * ROOM_DEGC - image)
-    result = align_thermal(turned(cold, [0.2, 0.3, -0.2]), body, walk(), RECIPE)
+    result = aligned(turned(cold, [0.2, 0.3, -0.2]), body, walk())
     assert errors(result, T_THERMAL_DEPTH)[0] < 0.1
 
 
 def test_nothing_to_see_says_so(body, scan):
     nothing = turned(blank(scan), [0.5, 0, 0])
-    result = align_thermal(nothing, body, walk(), RECIPE)
+    result = aligned(nothing, body, walk())
     assert not result.changed
     assert not result.converged
-    np.testing.assert_array_equal(result.T_thermal_depth, nothing.thermal.camera.T_thermal_depth)
+    np.testing.assert_array_equal(result.camera.T_thermal_depth, nothing.thermal.camera.T_thermal_depth)
     assert "does not stand out" in result.messages[0]
     assert result.sigma_time_s == PRIOR_TIME_S
 
@@ -130,7 +135,7 @@ def test_cut_end_of_the_model_is_no_outline(body, scan):
     """The upper half fused only: the body goes on below the cut, and the rig must not follow the cut."""
     keep = body.vertices_m[body.triangles].mean(1)[:, 2] > -0.05
     half = SurfaceMesh(body.vertices_m, body.triangles[keep], body.normals)
-    result = align_thermal(turned(scan, [0.3, -0.3, 0.26]), half, walk(), RECIPE)
+    result = aligned(turned(scan, [0.3, -0.3, 0.26]), half, walk())
     assert result.residual_px_after < 0.3
     assert inside_covariance(result)
     assert not result.changed or errors(result, T_THERMAL_DEPTH)[0] < 0.25  # one end less to hold the vertical
@@ -139,7 +144,7 @@ def test_cut_end_of_the_model_is_no_outline(body, scan):
 def test_model_swollen_by_fusion_moves_only_the_nuisance(body, scan):
     """2 mm of common swelling is 0.5 px: it goes into the outline's width, not into the rig."""
     swollen = SurfaceMesh(body.vertices_m + np.float32(0.002) * body.normals, body.triangles, body.normals)
-    result = align_thermal(turned(scan, [0.3, -0.3, 0.26]), swollen, walk(), RECIPE)
+    result = aligned(turned(scan, [0.3, -0.3, 0.26]), swollen, walk())
     assert errors(result, T_THERMAL_DEPTH)[0] < 0.1
     assert result.outline_width_px < -0.4
 
@@ -148,21 +153,21 @@ def test_steady_walk_leaves_the_clock_uncertain(body, scan):
     """Along a constant twist a clock error is a rig error: the covariance must not claim to know either."""
     steady_walk = walk(tremor=0.0)
     steady = make_scan(body, steady_walk)
-    shaky = align_thermal(delayed(scan, 0.04), body, walk(), RECIPE)
-    result = align_thermal(delayed(steady, 0.04), body, steady_walk, RECIPE)
+    shaky = aligned(delayed(scan, 0.04), body, walk())
+    result = aligned(delayed(steady, 0.04), body, steady_walk)
     assert result.sigma_time_s > 2 * shaky.sigma_time_s
-    assert abs(result.time_offset_s + 0.04) < 4 * result.sigma_time_s
+    assert abs(result.camera.time_offset_s + 0.04) < 4 * result.sigma_time_s
 
 
 def test_same_input_same_result_and_switches(body, scan):
     wrong = turned(scan, [0.3, 0, 0])
-    first, second = (align_thermal(wrong, body, walk(), RECIPE) for _ in range(2))
-    np.testing.assert_array_equal(first.T_thermal_depth, second.T_thermal_depth)
-    off = align_thermal(wrong, body, walk(), load_recipe({"crosscal": {"align": False}}))
+    first, second = (aligned(wrong, body, walk()) for _ in range(2))
+    np.testing.assert_array_equal(first.camera.T_thermal_depth, second.camera.T_thermal_depth)
+    off = aligned(wrong, body, walk(), load_recipe({"rig": {"align": False}}))
     assert not off.changed
     assert "recipe" in off.messages[0]
     with pytest.raises(ScanError, match="no thermal stream"):
-        align_thermal(replace(scan, thermal=None), body, walk(), RECIPE)
+        aligned(replace(scan, thermal=None), body, walk())
 
 
 @pytest.mark.parametrize(("rotation_deg", "clock_s"), [([0.3, -0.3, 0.26], 0.04), ([0.0, 0.5, 0.0], -0.04)])
@@ -177,6 +182,6 @@ def test_torso_recording(shared_data, rotation_deg, clock_s):
     R = Rotation.from_quat(rows[:, 4:8]).as_matrix()
     trajectory = Trajectory(rows[:, 0], np.stack([pose(r, p) for r, p in zip(R, rows[:, 1:4], strict=True)]))
     wrong = delayed(turned(open_scan(root), rotation_deg), clock_s)
-    result = align_thermal(wrong, surface, trajectory, RECIPE)
+    result = aligned(wrong, surface, trajectory)
     assert errors(result, truth["T_thermal_depth"])[0] < 0.1
-    assert result.time_offset_s == pytest.approx(-clock_s, abs=0.010)
+    assert result.camera.time_offset_s == pytest.approx(-clock_s, abs=0.010)

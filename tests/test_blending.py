@@ -4,17 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.problems import EXACT, errors, problem_of
 from support.synthetic_views import BAND, L_ROOM, REFLECTED_K, make_world
-from test_crosscal import EXACT, blackbodies, calibrate
+from test_crosscal import blackbodies, calibrate
 
 from thermofusion.physics.band import ZERO_DEGC_K
 from thermofusion.physics.emissivity import Blackbody, Fresnel
 from thermofusion.physics.equation import apparent_radiance, paper_chain
-from thermofusion.recipe import RadiometrySection, load_recipe
+from thermofusion.recipe import TemperatureSection
 from thermofusion.temperature import blend as blending
-from thermofusion.temperature.blend import blend, remove_air_path
-from thermofusion.temperature.crosscal import cross_calibrate
-from thermofusion.temperature.solve import error_model
+from thermofusion.temperature import crosscal
+from thermofusion.temperature.blend import blend
+from thermofusion.temperature.problem import remove_air_path
+from thermofusion.temperature.room import Room
 from thermofusion.temperature.uncertainty import (
     BILINEAR_VARIANCE,
     AngleTables,
@@ -46,10 +48,10 @@ def rows(*table):
     )
 
 
-def run(observations, n, *, calibration=None, model=MODEL, method="joint", **kwargs):
-    settings = RadiometrySection(method=method, **kwargs.pop("settings", {}))
-    kwargs = {"L_reflected": L_ROOM, "reflected_K": REFLECTED_K, "settings": settings, "errors": EXACT} | kwargs
-    return blend(observations, n, calibration, model, BAND, **kwargs)
+def run(observations, n, *, calibration=None, model=MODEL, method="joint", settings=None, **known):
+    settings = TemperatureSection(method=method, **(settings or {}))
+    n_views = int(observations.view.max(initial=0)) + 1
+    return blend(problem_of(observations, n, n_views, emissivity=model, settings=settings, **known), calibration)
 
 
 def seen(T_s, angle, model=MODEL):
@@ -177,7 +179,11 @@ def test_weight_falls_steeper_than_the_cosine():
     angles = [0, 40, 50, 60, 65, 70]
     observations = rows(*[(0, i, 32.0, a, 1.0) for i, a in enumerate(angles)])
     variance = observation_variance(
-        observations, 10.0, AngleTables.of(MODEL), ErrorModel(0.05, 2.5, 0.15, 0.0, 0.0), slope_L=1.0
+        observations,
+        10.0,
+        AngleTables.of(MODEL),
+        errors(sigma_normal_deg=2.5, sigma_registration_px=0.0, sigma_reflected_K=0.0),
+        slope_L=1.0,
     )
     weight = MODEL.relative(observations.cos_angle) ** 2 / variance
     np.testing.assert_allclose(weight[1:] / weight[0], [0.75, 0.48, 0.17, 0.075, 0.028], atol=0.18)
@@ -198,7 +204,7 @@ def test_parts_of_the_variance():
             "sigma_registration_px": 0,
             "sigma_reflected_K": 0,
         }
-        return float(np.sqrt(observation_variance(observations, 9.0, tables, ErrorModel(**(zero | kwargs)), 0.9)[0]))
+        return float(np.sqrt(observation_variance(observations, 9.0, tables, errors(**(zero | kwargs)), 0.9)[0]))
 
     assert sigma(netd_K=0.04) == pytest.approx(0.04 * 0.9, rel=1e-5)
     assert sigma(sigma_normal_deg=2.0) == pytest.approx(9 * slope * np.radians(2), rel=1e-3)
@@ -210,7 +216,7 @@ def test_parts_of_the_variance():
 
 def test_silhouettes_cost_what_the_budget_says():
     """766/161/21/2/0.1 mK at 1/1.5/2/2.5/3 px for 10 K of contrast and a point spread of 0.7 px."""
-    share = silhouette_share(np.array([1, 1.5, 2, 2.5, 3, 32.0]), ErrorModel(edge_margin_px=0.0))
+    share = silhouette_share(np.array([1, 1.5, 2, 2.5, 3, 32.0]), errors(edge_margin_px=0.0))
     np.testing.assert_allclose(10 * share, [0.766, 0.161, 0.021, 0.0018, 0.0001, 0], atol=6e-4)
     near = replace(THREE, edge_px=np.array([1.6, 32, 32], np.float32))
     tables = AngleTables.of(MODEL)
@@ -221,7 +227,8 @@ def test_silhouettes_cost_what_the_budget_says():
 
 def test_total_is_the_sum_of_its_parts_and_modes_keep_the_covariance():
     world = make_world(1, n_vertices=1000)
-    r = run(world.observations, 1000, calibration=calibrate(world, blackbodies=blackbodies(world)), air_K=295.0)
+    calibration = calibrate(world, blackbodies=blackbodies(world))
+    r = run(world.observations, 1000, calibration=calibration, room=Room(REFLECTED_K, 295.0))
     total = np.sqrt(sum(p.astype(float) ** 2 for p in r.uncertainty.parts_K.values()))
     np.testing.assert_allclose(r.uncertainty.total_K, total, rtol=1e-5)
     assert set(r.uncertainty.level_parts_K) == {"reference", "emissivity0", "reflected"}
@@ -236,7 +243,7 @@ def test_intervals_hold_what_they_promise():
     """Worlds whose reference, T_refl and normals err as declared: 1.96 σ covers 95 % of the errors in all of them,
     σ of a vertex and of the level together; and σ of a vertex alone those about the common level."""
     absolute, relative = [], []
-    errors = ErrorModel(0.05, sigma_normal_deg=1.5, sigma_registration_px=0.0, sigma_reflected_K=1.0)
+    believed = errors(sigma_normal_deg=1.5, sigma_registration_px=0.0, sigma_reflected_K=1.0)
     for seed in range(16):
         rng = np.random.default_rng(seed)
         sampled_K = 0.05 * np.sqrt(BILINEAR_VARIANCE)  # what bilinear sampling leaves of a pixel's noise
@@ -246,15 +253,16 @@ def test_intervals_hold_what_they_promise():
         readings = [replace(r, expected=r.expected + shift) for r in readings]
         believed_K = REFLECTED_K + rng.normal(0, 1.0)
         L_r = float(BAND.radiance(believed_K))
-        calibration = calibration_of(world, readings, L_r, errors)
-        r = run(
+        problem = problem_of(
             world.observations,
             world.n_vertices,
-            calibration=calibration,
-            errors=errors,
+            world.n_views,
+            errors=believed,
             L_reflected=L_r,
-            reflected_K=believed_K,
+            room=Room(believed_K, None),
+            blackbodies=tuple(readings),
         )
+        r = blend(problem, crosscal.calibrate(problem))
         error = r.absolute_K - world.T_K
         ok = np.isfinite(error)
         error, u = error[ok], r.uncertainty
@@ -264,23 +272,10 @@ def test_intervals_hold_what_they_promise():
     assert 0.92 < np.mean(relative) < 0.985
 
 
-def calibration_of(world, readings, L_r, errors):
-    return cross_calibrate(
-        world.observations,
-        world.n_vertices,
-        world.n_views,
-        MODEL,
-        BAND,
-        image_size=world.image_size,
-        L_reflected=L_r,
-        errors=errors,
-        blackbodies=readings,
-    )
-
-
 @pytest.mark.parametrize(("measured", "used"), [(None, 0.7), (1.3, 1.3)])
 def test_a_measured_point_spread_enters_the_budget(measured, used):
     camera = ThermalCamera(Camera(2, 2, np.eye(3)), np.eye(4), psf_sigma_px=measured)
-    errors = error_model(camera, load_recipe("torso"))
-    assert errors.psf_sigma_px == used
-    assert errors.netd_K == camera.netd_K
+    model = ErrorModel.of(camera, TemperatureSection(sigma_emissivity0=0.02))
+    assert model.psf_sigma_px == used
+    assert model.netd_K == camera.netd_K
+    assert model.sigma_emissivity0 == 0.02

@@ -4,34 +4,31 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.synthetic_views import BAND, HEIGHT, L_ROOM, REFLECTED_K, WIDTH, make_world, vignetting_K, with_view_order
+from support.problems import errors, problem_of
+from support.synthetic_views import BAND, HEIGHT, L_ROOM, WIDTH, make_world, vignetting_K, with_view_order
 
 from thermofusion.errors import ScanError
-from thermofusion.mapping.references import BlackbodyReading, ContactReading, read_blackbody
-from thermofusion.physics.band import ZERO_DEGC_K
+from thermofusion.mapping.references import BlackbodyReading, read_polygon
 from thermofusion.physics.emissivity import Fresnel, shape_direction, water
-from thermofusion.recipe import CrosscalSection
+from thermofusion.recipe import CrosscalSection, MappingSection, TemperatureSection
+from thermofusion.temperature import crosscal
 from thermofusion.temperature.blend import blend
-from thermofusion.temperature.crosscal import cross_calibrate
 from thermofusion.temperature.field import ImageField
-from thermofusion.temperature.uncertainty import ErrorModel
+from thermofusion.temperature.references import ContactReading, ExpectedReading, expected_readings
+from thermofusion.types import BlackbodyReference
 
 SKIN = {"dielectric": Fresnel(1.33), "non-dielectric": Fresnel(1.33, 0.25), "water": water(BAND)}
-EXACT = ErrorModel(0.05, sigma_normal_deg=0.5, sigma_registration_px=0.0)
 
 
-def calibrate(world, model=SKIN["dielectric"], observations=None, **kwargs):
-    return cross_calibrate(
-        world.observations if observations is None else observations,
-        world.n_vertices,
-        world.n_views,
-        model,
-        BAND,
-        image_size=world.image_size,
-        L_reflected=L_ROOM,
-        errors=kwargs.pop("errors", EXACT),
-        **kwargs,
+def calibrate(world, model=SKIN["dielectric"], observations=None, *, settings=None, max_angle_deg=65.0, **known):
+    temperature = TemperatureSection(crosscal=settings or CrosscalSection())
+    mapping = MappingSection(max_angle_deg=max_angle_deg)
+    observations = world.observations if observations is None else observations
+    known = {k: tuple(v) if k in ("blackbodies", "contacts") else v for k, v in known.items()}
+    problem = problem_of(
+        observations, world.n_vertices, world.n_views, emissivity=model, settings=temperature, mapping=mapping, **known
     )
+    return crosscal.calibrate(problem)
 
 
 def blackbodies(world, views=(0, 11, 23), u=200.0, v=150.0, T_K=308.15, sigma_K=0.03):
@@ -39,21 +36,13 @@ def blackbodies(world, views=(0, 11, 23), u=200.0, v=150.0, T_K=308.15, sigma_K=
     expected = 0.98 * float(BAND.radiance(T_K)) + 0.02 * L_ROOM
     measured = [expected + world.slope_L * float(world.offsets_K[k] + vignetting_K(u, v)) for k in views]
     slope = float(BAND.d_radiance_dT(T_K))
-    return [BlackbodyReading(k, m, expected, 1e-3, sigma_K * slope, u, v) for k, m in zip(views, measured, strict=True)]
+    known = (1e-3, u, v, expected, sigma_K * slope)
+    return [ExpectedReading(k, 0, m, *known) for k, m in zip(views, measured, strict=True)]
 
 
 def temperatures(world, calibration, model=SKIN["dielectric"], observations=None):
     observations = world.observations if observations is None else observations
-    return blend(
-        observations,
-        world.n_vertices,
-        calibration,
-        model,
-        BAND,
-        L_reflected=L_ROOM,
-        reflected_K=REFLECTED_K,
-        errors=EXACT,
-    )
+    return blend(problem_of(observations, world.n_vertices, world.n_views, emissivity=model), calibration)
 
 
 def true_shape(truth, assumed):
@@ -101,7 +90,7 @@ def test_a_wrong_preset_does_little_harm(truth, assumed):
 def test_normals_with_errors_and_outliers():
     """The design's expectation: about 0.1 K RMS with 2.5° normals, 0.12 K with 5 % outliers."""
     world = make_world(1, normal_error_deg=2.5, outliers=0.05)
-    c = calibrate(world, blackbodies=blackbodies(world), errors=ErrorModel(0.05, sigma_normal_deg=2.5))
+    c = calibrate(world, blackbodies=blackbodies(world), errors=errors(sigma_normal_deg=2.5))
     result = temperatures(world, c)
     error = (result.absolute_K - world.T_K)[result.count >= 5]
     assert np.sqrt(np.mean((error - np.median(error)) ** 2)) < 0.1
@@ -289,7 +278,7 @@ def test_covariance_is_what_noise_does():
     for seed in range(24):
         noise = np.random.default_rng(seed).normal(0, 0.05 * world.slope_L, len(clean))
         obs = replace(world.observations, radiance=(clean + noise).astype(np.float32))
-        flat = ErrorModel(0.05, sigma_normal_deg=0.0, sigma_shape=0.0, sigma_reflected_K=0.0)
+        flat = errors(sigma_normal_deg=0.0, sigma_shape=0.0, sigma_reflected_K=0.0)
         c = calibrate(world, observations=obs, errors=flat, settings=CrosscalSection(vignetting=False))
         spread.append(c.offsets_K)
         claimed = np.sqrt(np.diag(c.covariance)[: world.n_views].mean()) / c.slope_L
@@ -320,23 +309,17 @@ def test_blackbody_is_read_from_inside_its_polygon():
     image[85, 95] = 90.0  # a bad pixel
     a = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     polygon = np.stack([100.3 + 20 * np.cos(a), 80 + 20 * np.sin(a)], axis=1)
-    reading = read_blackbody(
-        image, polygon, view=4, T_K=308.15, sigma_K=0.03, emissivity=0.98, L_reflected=L_ROOM, band=BAND, netd_K=0.05
-    )
-    assert reading is not None
-    assert reading.measured == pytest.approx(63.0, abs=0.01)
+    netd_L = 0.05 * float(BAND.d_radiance_dT(308.15))
+    measured, sigma, u, v = read_polygon(image, polygon, netd_L)
+    assert measured == pytest.approx(63.0, abs=0.01)
+    assert (u, v) == pytest.approx((100.3, 80.0), abs=0.5)
+    assert sigma < 0.01
+    assert read_polygon(np.full((240, 320), np.nan), polygon, netd_L) is None
+
+
+def test_a_blackbody_should_read_its_own_radiation_and_the_rooms():
+    source = BlackbodyReference(35.0, 0.03, 0.98, np.zeros((3, 2)), (4,))
+    (reading,) = expected_readings([BlackbodyReading(4, 0, 63.0, 0.01, 100.3, 80.0)], [source], BAND, L_ROOM)
+    assert reading.measured == 63.0
     assert reading.expected == pytest.approx(0.98 * float(BAND.radiance(308.15)) + 0.02 * L_ROOM)
-    assert (reading.u_px, reading.v_px) == pytest.approx((100.3, 80.0), abs=0.5)
-    assert reading.sigma_measured < 0.01
-    blind = read_blackbody(
-        np.full((240, 320), np.nan),
-        polygon,
-        view=0,
-        T_K=35 + ZERO_DEGC_K,
-        sigma_K=0.03,
-        emissivity=1.0,
-        L_reflected=L_ROOM,
-        band=BAND,
-        netd_K=0.05,
-    )
-    assert blind is None
+    assert reading.sigma_expected == pytest.approx(0.98 * 0.03 * float(BAND.d_radiance_dT(308.15)))

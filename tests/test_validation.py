@@ -7,55 +7,50 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.synthetic_views import BAND, HEIGHT, L_ROOM, REFLECTED_K, WIDTH, make_world, vignetting_K
+from support.problems import errors, problem_of
+from support.synthetic_views import BAND, L_ROOM, REFLECTED_K, make_world, vignetting_K
 
 from thermofusion.cli import main
 from thermofusion.errors import RecipeError, ScanError
 from thermofusion.judge.leftout import WELL_SEEN_COS, Bench
 from thermofusion.judge.maperror import map_error
 from thermofusion.judge.validate import validate
-from thermofusion.mapping.references import BlackbodyReading
 from thermofusion.phantom import load_scene, simulate
 from thermofusion.physics.band import ZERO_DEGC_K
 from thermofusion.physics.emissivity import Fresnel
 from thermofusion.recipe import load_recipe
 from thermofusion.robust import Statistics, mad_sigma, weighted_quantile
 from thermofusion.scans import open_scan
-from thermofusion.temperature.uncertainty import BILINEAR_VARIANCE, ErrorModel
-from thermofusion.types import Camera, SurfaceMesh
+from thermofusion.temperature.references import ExpectedReading
+from thermofusion.temperature.room import Room
+from thermofusion.temperature.uncertainty import BILINEAR_VARIANCE
+from thermofusion.types import SurfaceMesh
 
 NEVER = lambda stage, done, total: None  # noqa: E731
 
 
-def make_bench(world, netd_K, normal_deg=0.3, *, field=True, **recipe_changes):
+def make_bench(world, netd_K, normal_deg=0.3, *, field=True, **changes):
     """A bench of a synthetic world. Its readings are single pixels, so the camera's NETD is stated accordingly."""
-    overrides = [f"{k.replace('__', '.')}={v}" for k, v in recipe_changes.items()]
-    errors = ErrorModel(
+    settings = load_recipe({}, [f"temperature.{k.replace('__', '.')}={v}" for k, v in changes.items()]).temperature
+    quiet = errors(
         netd_K / np.sqrt(BILINEAR_VARIANCE),
         sigma_normal_deg=normal_deg,
         sigma_registration_px=0.0,
         sigma_reflected_K=0.0,
         sigma_emissivity0=0.0,
     )
-    rows = world.observations
-    straight = rows.cos_angle >= np.cos(np.radians(65))
-    return Bench(
-        vertices=np.arange(world.n_vertices),
-        observations=rows,
-        well_seen=np.bincount(rows.vertex[rows.cos_angle > WELL_SEEN_COS], minlength=world.n_vertices) >= 2,
-        counts=straight,
-        n_views=world.n_views,
+    rows, n = world.observations, world.n_vertices
+    problem = problem_of(
+        rows,
+        n,
+        world.n_views,
         blackbodies=blackbodies(world, field=field),
-        camera=Camera(WIDTH, HEIGHT, np.array([[300.0, 0, WIDTH / 2], [0, 300.0, HEIGHT / 2], [0, 0, 1]])),
-        band=BAND,
-        emissivity=Fresnel(1.33),
-        L_reflected=np.full(world.n_vertices, L_ROOM),
-        reflected_K=REFLECTED_K,
-        air_K=32.5 + ZERO_DEGC_K,
-        errors=replace(errors, gradient_K_per_m=np.zeros(world.n_vertices, np.float32)),
-        per_patch=1.0,
-        recipe=load_recipe("torso", overrides),
+        errors=replace(quiet, gradient_K_per_m=np.zeros(n, np.float32)),
+        room=Room(REFLECTED_K, 32.5 + ZERO_DEGC_K),
+        settings=settings,
     )
+    problem = replace(problem, counts=rows.cos_angle >= np.cos(np.radians(65)))
+    return Bench(problem, np.bincount(rows.vertex[rows.cos_angle > WELL_SEEN_COS], minlength=n) >= 2)
 
 
 def blackbodies(world, *, field, T_K=308.15, u=200.0, v=150.0):
@@ -64,7 +59,7 @@ def blackbodies(world, *, field, T_K=308.15, u=200.0, v=150.0):
     slope = float(BAND.d_radiance_dT(T_K))
     fault_K = world.offsets_K + (vignetting_K(u, v) if field else 0.0)
     return tuple(
-        BlackbodyReading(k, expected + world.slope_L * float(fault_K[k]), expected, 1e-3, 0.03 * slope, u, v)
+        ExpectedReading(k, 0, expected + world.slope_L * float(fault_K[k]), 1e-3, u, v, expected, 0.03 * slope)
         for k in range(0, world.n_views, 6)
     )
 
@@ -110,7 +105,7 @@ def test_method_without_calibration_is_predicted_too():
     """Plain means keep the views' drift in the map: worse by far than the joint solution on the same views."""
     world = make_world(3, drift_K=1.0)
     joint = make_bench(world, 0.05).predictions(4, NEVER)
-    mean = make_bench(world, 0.05, radiometry__method='"mean"').predictions(4, NEVER)
+    mean = make_bench(world, 0.05, method='"mean"').predictions(4, NEVER)
     assert mad_sigma(mean.residual_K) > 2 * mad_sigma(joint.residual_K)
 
 
@@ -182,7 +177,7 @@ def ball(tmp_path_factory):
 def test_validate_from_recording_to_report(ball, tmp_path, capsys):
     """The verb: runs the scan, leaves views out, reports; the second time it reuses what is stored."""
     out = tmp_path / "out"
-    arguments = ["validate", str(ball), "-r", "torso", "--set", "radiometry.reflected_degC=20", "-o", str(out)]
+    arguments = ["validate", str(ball), "-r", "torso", "--set", "temperature.reflected_degC=20", "-o", str(out)]
     with pytest.raises(SystemExit) as stopped:
         main([*arguments, "--set", "output.views=false", "--folds", "3", "--json"])
     report = json.loads(capsys.readouterr().out)

@@ -7,7 +7,7 @@ from typing import Any
 
 from ..pipeline import Result
 from ..recipe import Recipe
-from ..temperature.solve import METHODS, measure
+from ..temperature.solve import METHODS, solve
 from ..types import Scan, ThermalMesh
 from .prepared import Case, Prepared
 from .report import Figure, Number
@@ -38,8 +38,9 @@ def _figure(stem: str, cases: Sequence[Case]) -> Figure:
 
 def _by_method(scan: Scan, recipe: Recipe, result: Result, method: str) -> ThermalMesh:
     """The same surface and observations, blended by another method."""
-    assert result.seen is not None
-    if method == recipe.radiometry.method:
+    assert result.surface is not None
+    assert result.mapped is not None
+    if method == recipe.temperature.method:
         return result.mesh
-    other = recipe.model_copy(update={"radiometry": recipe.radiometry.model_copy(update={"method": method})})
-    return measure(scan, result.mesh.surface, result.seen, other).mesh
+    other = recipe.temperature.model_copy(update={"method": method})
+    return solve(scan, result.surface, result.mapped, mapping=recipe.mapping, temperature=other).mesh

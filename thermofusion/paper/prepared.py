@@ -42,7 +42,7 @@ class Prepared:
     @cached_property
     def cylinder(self) -> Case:
         """The phantom cylinder in 3D, through an even lens."""
-        recipe = load_recipe("phantom-cylinder", ["crosscal.vignetting=false"])
+        recipe = load_recipe("phantom-cylinder", ["temperature.crosscal.vignetting=false"])
         return self._simulated("cylinder", cylinder_scene(), "cylinder", recipe)
 
     @cached_property

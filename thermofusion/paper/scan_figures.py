@@ -191,8 +191,8 @@ def _side_numbers(table: ByAngle) -> list[Number]:
 
 def _front_view(result: Result) -> int:
     """The view from the most frontal place."""
-    assert result.seen is not None
-    eye = result.seen.views.T_world_thermal[:, :3, 3] - result.mesh.surface.vertices_m.mean(0)
+    assert result.mapped is not None
+    eye = result.mapped.views.T_world_thermal[:, :3, 3] - result.mesh.surface.vertices_m.mean(0)
     front = axes_of(result.mesh.metadata)[2]
     return int(np.argmax(eye @ front / np.linalg.norm(eye, axis=1)))
 
@@ -220,7 +220,7 @@ def _side_pictures(result: Result, c: Compared, frontal: int) -> list[Picture]:
 
 def _better_side(result: Result, c: Compared, facing: NDArray) -> str:
     """`left` or `right`: the side that more views face."""
-    assert result.seen is not None
+    assert result.mapped is not None
     right = axes_of(result.mesh.metadata)[0]
     seen = np.unique(c.rows.vertex[facing])
     return "left" if float(np.median(result.mesh.surface.normals[seen] @ right)) > 0 else "right"

@@ -16,6 +16,7 @@ from ..physics.band import ZERO_DEGC_K, Band
 from ..physics.emissivity import EmissivityModel, model_from_recipe
 from ..recipe import Recipe
 from ..robust import SIGMA_PER_MAD
+from ..temperature.room import room_of
 from ..types import Float, Observations, Scan
 from .models import SKIN, by_radiance_degC, eqs25_27_degC
 
@@ -87,14 +88,12 @@ def compared(result: Result, scan: Scan, recipe: Recipe, models: Mapping[str, Em
     Methods whose name begins with "joint" have the camera's offsets and field removed by the cross-calibration, and use
     the fitted ε(θ) and what the body itself adds to the reflection.
     """
-    assert result.seen is not None
+    assert result.mapped is not None
     assert result.temperature is not None
     assert scan.thermal is not None
-    from ..temperature.solve import room_of
-
-    rows = result.seen.observations.select(result.seen.observations.edge_px >= EDGE_PX)
+    rows = result.mapped.observations.select(result.mapped.observations.edge_px >= EDGE_PX)
     band = Band(*scan.thermal.camera.band_um)
-    room_K = room_of(scan.environment, recipe).reflected_K
+    room_K = room_of(scan.environment, recipe.temperature).reflected_K
     cos = rows.cos_angle.astype(np.float64)
     L = rows.radiance.astype(np.float64)
     apparent = band.temperature_K(L) - ZERO_DEGC_K
@@ -112,15 +111,15 @@ def compared(result: Result, scan: Scan, recipe: Recipe, models: Mapping[str, Em
     if calibration is not None:
         L_camera = calibration.corrected(rows)
         values["offsets removed, uncorrected"] = band.temperature_K(L_camera) - ZERO_DEGC_K
-        model = calibration.emissivity(model_from_recipe(recipe.emissivity, band))
+        model = calibration.emissivity(model_from_recipe(recipe.temperature.emissivity, band))
         values["joint"] = by_radiance_degC(L_camera, cos, model, _reflected(result, rows, band, L_room), band)
     return Compared(rows, np.degrees(np.arccos(np.clip(cos, 0, 1))), values)
 
 
 def _axis_cosine(result: Result, rows: Observations) -> Float:
     """|n·z| of Eq. 28, kept off zero."""
-    assert result.seen is not None
-    z = result.seen.views.T_world_thermal[:, :3, 2]
+    assert result.mapped is not None
+    z = result.mapped.views.T_world_thermal[:, :3, 2]
     n = result.mesh.surface.normals
     return np.clip(np.abs(np.einsum("ij,ij->i", n[rows.vertex].astype(np.float64), z[rows.view])), 0.05, 1)
 

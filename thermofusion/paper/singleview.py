@@ -76,9 +76,9 @@ def on_vertices(count: int, vertex: Int, values: NDArray) -> Float:
 
 def first_view(result: Result, scan: Scan, room_degC: float) -> View:
     """The first of a result's thermal views."""
-    assert result.seen is not None
+    assert result.mapped is not None
     assert scan.thermal is not None
-    seen, surface = result.seen, result.mesh.surface
+    seen, surface = result.mapped, result.mesh.surface
     rows = seen.observations.select(seen.observations.view == 0)
     T, camera = seen.views.T_world_thermal[0], scan.thermal.camera
     band = Band(*camera.band_um)

@@ -84,6 +84,8 @@ def _pack(value: Any, arrays: dict[str, np.ndarray]) -> Any:
 
 
 def _unpack(node: Any, z: zipfile.ZipFile) -> Any:
+    if isinstance(node, list):
+        raise ValueError("a bare list")
     if not isinstance(node, dict):
         return node
     ((kind, content), *_) = node.items()

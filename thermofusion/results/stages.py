@@ -1,8 +1,8 @@
 """Stages that are not computed twice.
 
-A stage's key is the hash of everything that goes into it: the scan's fingerprint, the recipe sections it reads (the same
-that it is handed), the edition of its code, and the key of the stage before. A stored artifact with the same key is
-taken as it is. Artifact and key are one file.
+A stage's key is the hash of everything that goes into it: the scan's fingerprint, the recipe sections it reads (the
+same that it is handed), the edition of its code, and the key of the stage before. A stored artifact with the same key
+is taken as it is. Artifact and key are one file.
 """
 
 from __future__ import annotations
@@ -38,8 +38,10 @@ STALE = (
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """A step of the method. reads : the recipe sections that it is handed, and that its key holds. edition : raised when
-    the numbers that its code makes change."""
+    """A step of the method.
+
+    reads : the recipe sections that it is handed, and that its key holds. edition : raised when its numbers change.
+    """
 
     name: str
     reads: tuple[str, ...]

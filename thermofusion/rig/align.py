@@ -116,19 +116,20 @@ def align(
     outlines, contrast = read_outlines(stream, mesh, frames.tolist(), T_world_thermal, progress)
     if len(outlines) < MIN_VIEWS:
         return _unchanged(camera, f"fewer than {MIN_VIEWS} thermal views show an outline that could be used")
-    begin = start
+    begin = camera
     if contrast is None:  # nothing where it should be: perhaps the rig is off by degrees
         shift = search_shift(camera.lens, outlines, invert(T_world_thermal))
         if shift is not None:
             rotation = shift[::-1] / camera.lens.focal_px * [-1, 1]
-            begin = start.moved(np.concatenate([rotation, np.zeros(6)]))
+            turned = start.moved(np.concatenate([rotation, np.zeros(6)]))
+            begin = replace(camera, T_thermal_depth=turned.T_thermal_depth)
             T_world_thermal = T_world_depth @ invert(begin.T_thermal_depth)
             outlines, contrast = read_outlines(stream, mesh, frames.tolist(), T_world_thermal, progress)
     if contrast is None or len(outlines) < MIN_VIEWS:
         return _unchanged(camera, "the outline does not stand out from the background in the thermal images")
     times_s = stream.times_s[frames[[v.row for v in outlines]]]
-    result = _refined(OutlineSet(camera.lens, trajectory, outlines, times_s, contrast), begin, camera)
-    if begin is start:
+    result = _refined(OutlineSet(camera.lens, trajectory, outlines, times_s, contrast), begin)
+    if begin is camera:
         return result
     if not result.converged:
         return _unchanged(camera, "the outline was found far from where the rig says, but did not come to rest there")
@@ -148,8 +149,9 @@ def _frames(stream: ThermalStream, trajectory: Trajectory, max_gap_s: float) -> 
     return frames
 
 
-def _refined(outlines: OutlineSet, start: State, camera: ThermalCamera) -> RigResult:
-    """The rig that fits the outlines, or the start where chance would explain the change as well."""
+def _refined(outlines: OutlineSet, camera: ThermalCamera) -> RigResult:
+    """The rig that fits the outlines, or the one given where chance would explain the change as well."""
+    start = State.of(camera)
     before = outlines.residual_px(start)
     solved = solve(outlines, start)
     if solved is None:
@@ -175,7 +177,7 @@ def _refined(outlines: OutlineSet, start: State, camera: ThermalCamera) -> RigRe
     why = "did not come to rest" if not solved.converged else "is within what chance would give"
     return replace(
         result,
-        camera=replace(camera, T_thermal_depth=start.T_thermal_depth, time_offset_s=start.time_offset_s),
+        camera=camera,
         residual_px_after=before,
         changed=False,
         messages=(f"the rig is left alone: a change ({found}) {why}",),

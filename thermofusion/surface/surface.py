@@ -31,7 +31,8 @@ class SurfaceResult:
 
     mesh : in world metres. voxel_m, truncation_m : of the grid. max_range_m : depth beyond it was not used.
     noise_m_at_1m : depth noise estimated from the data, grows with range². blocks_estimated, blocks_used, memory_gib :
-    of the grid. normal_window_m : diameter over which normals were averaged. floor_plane : (4,) `[n, d]`, n·p + d = height above the floor in metres; None = none found.
+    of the grid. normal_window_m : diameter over which normals were averaged. floor_plane : (4,)
+    `[n, d]`, n·p + d = height above the floor in metres; None = none found.
     """
 
     mesh: SurfaceMesh

@@ -116,7 +116,7 @@ class RobustMean:
         return self.groups.sums(weight * self.E * self.E)
 
     def scatter(self, solved: Solved) -> tuple[Float, Float]:
-        """Per group (G,): rms of residuals in sigmas of the rows' own errors, and in radiance; NaN with one row only."""
+        """Per group (G,): rms of residuals in sigmas of the rows' own, and in radiance; NaN with one row."""
         squares, n = self.residual(solved.x) ** 2, self.groups.count
         freedom = np.where(n > 1, n - 1, np.nan)
         sigmas = np.sqrt(self.groups.sums(self.weight * squares) / freedom)

@@ -68,7 +68,8 @@ class ThermalProblem:
         camera = scan.thermal.camera
         band, room = Band(*camera.band_um), room_of(scan.environment, settings)
         L_room = float(band.radiance(room.reflected_K))
-        rows = remove_air_path(mapped.observations, settings.transmission_per_m, float(band.radiance(room.air_K)))
+        L_air = float(band.radiance(room.air_K or room.reflected_K))
+        rows = remove_air_path(mapped.observations, settings.transmission_per_m, L_air)
         clear, counts = clear_of_silhouettes(rows, len(surface), mapping.silhouette_px)
         rows, clear = rows.select(counts), clear[counts]
         straight = rows.cos_angle >= np.float32(np.cos(np.radians(mapping.max_angle_deg)))
@@ -111,7 +112,7 @@ class ThermalProblem:
         return replace(self, L_reflected=lit)
 
     def informed(self, surface: SurfaceMesh, T_K: Float) -> ThermalProblem:
-        """With what a first map (V,) K tells: the body's own radiation, and where temperature changes along the skin."""
+        """With what a first map (V,) K tells: the body's own radiation, the temperature's slope along the skin."""
         errors = replace(self.errors, gradient_K_per_m=edge_gradient(surface.vertices_m, surface.triangles, T_K))
         return replace(self.lit_by(self.band.radiance(T_K)), errors=errors)
 

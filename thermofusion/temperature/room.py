@@ -13,10 +13,10 @@ DEFAULT_ROOM_DEGC = 23.0  # taken, and said, where neither scan nor recipe knows
 
 @dataclass(frozen=True)
 class Room:
-    """Temperatures of what surrounds the subject, K, and what had to be assumed of them."""
+    """Temperatures of what surrounds the subject, K, and what had to be assumed of them; air None: not budgeted."""
 
     reflected_K: float
-    air_K: float
+    air_K: float | None
     assumed: tuple[str, ...] = ()
 
 

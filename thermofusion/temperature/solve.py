@@ -166,7 +166,7 @@ def _mesh(
         observations=result.count,
         flags=flags,
         uncertainty_parts=parts,
-        metadata=metadata | level,
+        metadata={**metadata, **level},
     )
 
 

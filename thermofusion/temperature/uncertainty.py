@@ -218,7 +218,7 @@ class Budget:
     shape_fitted: bool
     epsilon0_follows: bool
     reference_sigma_K: float
-    air_K: float
+    air_K: float | None
     transmission_per_m: float
 
     @property
@@ -255,7 +255,7 @@ def vertex_uncertainty(
         "normals": scale * np.abs(x) * tilt * normal,
         "registration": np.asarray(errors.gradient_K_per_m) * levers.registration_m,
         "silhouette": scale * np.abs(x) * levers.silhouette,
-        "air": np.abs(T_K - b.air_K) * air_loss * np.abs(path_m),
+        "air": zero if b.air_K is None else np.abs(T_K - b.air_K) * air_loss * np.abs(path_m),
     }
     if views_K is not None:
         parts["views"] = np.nan_to_num(views_K)
