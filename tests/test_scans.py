@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from conftest import ROOT
 from support import scan_maker as make
+from support.scan_maker import backproject, write_pnm
 
 from thermofusion.errors import RecipeError, ScanError
-from thermofusion.files.pnm import read_pnm, write_pnm
-from thermofusion.geometry.camera import backproject, project
+from thermofusion.files.pnm import read_pnm
+from thermofusion.geometry.camera import project
 from thermofusion.geometry.rigid import pose, se3_exp, transform_points
 from thermofusion.mapping.views import NO_POSE, OUTSIDE, SHUTTER, thermal_views
 from thermofusion.physics.signal import counts_to_kelvin

@@ -97,9 +97,3 @@ def srgb_to_linear(srgb: UInt8) -> NDArray[np.float32]:
     c = np.arange(256) / 255
     linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4).astype(np.float32)
     return linear[srgb]
-
-
-def lightness(srgb: UInt8) -> NDArray[np.float32]:
-    """CIE L* (0..100) of sRGB bytes (..., 3), D65 white."""
-    y = srgb_to_linear(srgb) @ np.array([0.2126, 0.7152, 0.0722], np.float32)
-    return np.where(y > (6 / 29) ** 3, 116 * np.cbrt(y) - 16, y * (29 / 3) ** 3)

@@ -79,12 +79,6 @@ def pixel_rays(camera: Camera, u_px: NDArray | None = None, v_px: NDArray | None
     return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
 
-def backproject(camera: Camera, depth_m: NDArray) -> Float:
-    """Depth image (H, W) in metres along z, NaN = none, to points (H, W, 3) in the camera's frame."""
-    rays = pixel_rays(camera)
-    return rays * (depth_m / rays[..., 2])[..., None]
-
-
 def viewing_cosine(points: NDArray, normals: NDArray, eye: NDArray) -> NDArray:
     """Cosine of the viewing angle: between the unit normal and the ray from the surface to the eye, (N,).
 

@@ -16,7 +16,8 @@ from ..phantom import SceneConfig, load_scene, simulate
 from ..pipeline import Result, fuse
 from ..recipe import load_recipe
 from ..report.casts import Cast, cast_views
-from ..report.pictures import Scale, paint
+from ..report.lettering import Scale
+from ..report.pictures import paint
 from ..report.plot import BLUE, GREY, ORANGE, Axis, Bar, Line, Picture, Plot, Points, page
 from ..scans import open_scan
 from ..types import Float, Scan, UInt8

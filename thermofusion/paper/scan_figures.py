@@ -15,7 +15,8 @@ from ..physics.emissivity import Cosine, Fresnel
 from ..pipeline import Result, fuse
 from ..recipe import Recipe, load_recipe
 from ..report.casts import cast_views
-from ..report.pictures import Scale, paint
+from ..report.lettering import Scale
+from ..report.pictures import paint
 from ..report.plot import (
     AMBER,
     BLUE,

@@ -1,7 +1,7 @@
 """How emissivity falls with the viewing angle: ε(θ) of the paper's models, of water, and of tables.
 
 θ is the angle between the surface normal and the pixel's own ray (not the camera axis of the paper's Eq. 28). Models
-are small frozen values; `model(cos_theta)` is exact, `model.lookup()` a float32 table for millions of observations.
+are small frozen values; `model(cos_theta)` is exact, `AngleTable` serves millions of observations.
 """
 
 from __future__ import annotations
@@ -84,10 +84,6 @@ class EmissivityModel:
         x, w = np.polynomial.legendre.leggauss(64)
         mu = 0.5 * (x + 1)
         return float(np.sum(w * self(mu) * mu))
-
-    def lookup(self) -> AngleTable:
-        """ε as a float32 table over cosθ, within 1e-6 of the exact value."""
-        return AngleTable.of(self)
 
 
 @dataclass(frozen=True)

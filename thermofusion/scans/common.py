@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -49,38 +50,51 @@ def make_stream(
     return Stream(t, load, tuple(str(p) for p in places), numbers, flags)
 
 
+@dataclass(frozen=True, eq=False)
+class ImageFiles:
+    """The image files of one camera, in time order.
+
+    paths, times_s : (N,). place : the file that lists them, or their folder, for messages. index : (N,) the recording's
+    own numbers; None = 0, 1, 2 ... usable : (N,) mask; None = all.
+    """
+
+    kind: Kind
+    paths: Sequence[Path]
+    times_s: Sequence[float] | NDArray
+    place: object
+    index: Sequence[int] | NDArray | None = None
+    usable: Sequence[bool] | NDArray | None = None
+
+
 def image_stream(
-    kind: Kind,
-    files: Sequence[Path],
-    times_s: Sequence[float] | NDArray,
+    files: ImageFiles,
     camera: Camera,
     *,
-    place: object,
     unit_m: float = 0.001,
     invalid: tuple[int, ...] = (0,),
     decode: Callable[[bytes, object], NDArray] | None = None,
-    index: Sequence[int] | NDArray | None = None,
-    usable: Sequence[bool] | NDArray | None = None,
 ) -> Stream:
     """A stream of image files, decoded when asked for.
 
-    unit_m, invalid : of depth. decode : (bytes, place) -> raw image, for files that are no ordinary images.
+    unit_m, invalid : of depth. decode : (bytes, place) -> raw image (H, W) or (H, W, 3) as stored, for files that are
+    no ordinary images.
     """
+    kind, paths = files.kind, files.paths
 
     def load(i: int) -> NDArray:
-        data = read_bytes(files[i], kind)
+        data = read_bytes(paths[i], kind)
         if decode is None:
-            raw = decode_image(data, shape=camera.shape, kind=kind, place=files[i])
+            raw = decode_image(data, shape=camera.shape, kind=kind, place=paths[i])
         else:
-            raw = decode(data, files[i])
+            raw = decode(data, paths[i])
         if raw.shape[:2] != camera.shape:
             raise ScanError(
                 f"the {kind} is {raw.shape[1]} x {raw.shape[0]} px, expected {camera.width_px} x {camera.height_px}",
-                place=files[i],
+                place=paths[i],
             )
-        return as_loaded(kind, raw, files[i], unit_m, invalid)
+        return as_loaded(kind, raw, paths[i], unit_m, invalid)
 
-    return make_stream(times_s, load, files, place=place, kind=kind, index=index, usable=usable)
+    return make_stream(files.times_s, load, paths, place=files.place, kind=kind, index=files.index, usable=files.usable)
 
 
 def as_loaded(kind: Kind, raw: NDArray, place: object, unit_m: float, invalid: tuple[int, ...] = (0,)) -> NDArray:
