@@ -17,8 +17,7 @@ from ..physics.emissivity import (
     fresnel_reflectivity,
     water,
 )
-from ..report.plot import BLUE, DASHED, GREEN, INK, ORANGE, PURPLE, Axis, Line, Plot, Points, Polar, page
-from ..report.plot import Band as Area
+from ..report.plot import BLUE, DASHED, GREEN, INK, ORANGE, PURPLE, Area, Axis, Line, Plot, Points, Polar, page
 from ..types import Float
 from .report import FigureReport, Number, Writer
 

@@ -21,7 +21,7 @@ COSINE_EPSILON0 = 0.98  # the paper's reference model is 0.98·cosθ
 # n, k of the models that take them: the paper's skin, and an effective index of water at 307 K (9e-4 up to 85°)
 PRESETS = {"dielectric": (1.33, 0.0), "non-dielectric": (1.33, 0.25), "fitted": (1.2233, 0.1304)}
 WATER_T_K = 306.0  # Planck weight of the water model's band average
-MIN_OVERLAP = 0.75  # share of the band that the water table must cover
+MIN_BAND_SHARE = 0.75  # share of the band that the water table must cover
 LOOKUP_KNOTS = 4097
 
 # Hale & Querry, Appl. Opt. 12, 555 (1973): wavelength µm, n, k of water at 25 °C (values CC0 in refractiveindex.info).
@@ -219,7 +219,7 @@ def water(band: Band) -> EmissivityModel:
     """
     lam, n, k = HALE_QUERRY_1973.T
     lo, hi = max(band.lo_um, lam[0]), min(band.hi_um, lam[-1])
-    if hi - lo < MIN_OVERLAP * (band.hi_um - band.lo_um):
+    if hi - lo < MIN_BAND_SHARE * (band.hi_um - band.lo_um):
         raise RecipeError(
             f"the water model is tabulated for 7.5-13.5 µm, the camera's band is {band.lo_um:g}-{band.hi_um:g} µm",
             place="emissivity.model",

@@ -14,7 +14,7 @@ from ..types import Float
 from .fragments import Fragment, build_fragment
 from .frames import TrackingFrame, TrackingFrames
 from .maps import DepthMap, Intrinsics
-from .registration import REACH_M, Partners, agreement, find_partners, register
+from .registration import REACH_M, Partners, agreement, find_partners, register_view
 
 REACHES_M = (0.08, 0.05, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03)
 # A second try from standing still, with a far reach: for a jerk that the last motion did not announce.
@@ -86,7 +86,9 @@ class GrowingSegment:
             return False
         dt_s = max(frame.time_s - self._last.time_s, 1e-3)
         for start, reaches in ((se3_exp(self._velocity * dt_s), REACHES_M), (np.eye(4), RESCUE_REACHES_M)):
-            T_last_now, _ = register(frame.map, [(self._last.map, np.eye(4))], start, reaches, tolerance=STEP_TOLERANCE)
+            T_last_now, _ = register_view(
+                frame.map, [(self._last.map, np.eye(4))], start, reaches, tolerance=STEP_TOLERANCE
+            )
             partners = find_partners(frame.map, self._last.map, T_last_now, REACH_M)
             believed = _believed(partners, self._tracking) and _possible(T_last_now, dt_s)
             if believed and agreement(frame.map, self._last.map, T_last_now, stride=2) >= MIN_AGREEMENT:
@@ -99,7 +101,7 @@ class GrowingSegment:
         """Append a frame whose pose is known from elsewhere (a recorded trajectory). Within a fragment its motion is
         still measured: recorded poses may jitter."""
         start, last = invert(self._T[-1]) @ T, [(self._last.map, np.eye(4))]
-        T_last_now, _ = register(frame.map, last, start, REACHES_M[1:], tolerance=STEP_TOLERANCE)
+        T_last_now, _ = register_view(frame.map, last, start, REACHES_M[1:], tolerance=STEP_TOLERANCE)
         partners = find_partners(frame.map, self._last.map, T_last_now, REACH_M)
         if not _believed(partners, self._tracking):
             T_last_now = start

@@ -97,7 +97,7 @@ class Seen:
     sent: int
 
 
-def compare(source: DepthMap, target: DepthMap, T_target_source: Float, reach_m: float, stride: int = 1) -> Seen:
+def seen_from(source: DepthMap, target: DepthMap, T_target_source: Float, reach_m: float, stride: int = 1) -> Seen:
     """Whether the target, from where it is, could have taken its image of the source's points."""
     partners = find_partners(source, target, T_target_source, reach_m, stride)
     p = source.sample[::stride] @ T_target_source[:3, :3].T + T_target_source[:3, 3]
@@ -111,7 +111,7 @@ def compare(source: DepthMap, target: DepthMap, T_target_source: Float, reach_m:
 
 def agreement(a: DepthMap, b: DepthMap, T_b_a: Float, stride: int = 1) -> float:
     """Share of what both views could see that agrees, outlines included; 0 where they share nothing."""
-    one, other = compare(a, b, T_b_a, REACH_M, stride), compare(b, a, invert(T_b_a), REACH_M, stride)
+    one, other = seen_from(a, b, T_b_a, REACH_M, stride), seen_from(b, a, invert(T_b_a), REACH_M, stride)
     agree = one.agree + other.agree
     return agree / max(agree + one.conflict + other.conflict, 1)
 
@@ -171,7 +171,7 @@ def _accumulate(rows: Rows, w: Float, T_world_target: Float) -> tuple[Float, Flo
     return Jw.T @ J, Jw.T @ rows.residual
 
 
-def register(
+def register_view(
     source: DepthMap,
     targets: Sequence[tuple[DepthMap, Float]],
     T_world_source: Float,

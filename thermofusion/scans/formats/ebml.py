@@ -40,7 +40,7 @@ class Track:
 
 
 @dataclass(frozen=True)
-class Frame:
+class FrameBytes:
     """Where a frame's bytes lie in the file, and its time."""
 
     track: int
@@ -56,7 +56,7 @@ class Matroska:
     tracks: dict[int, Track] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
     tags: dict[str, str] = field(default_factory=dict)
-    frames: list[Frame] = field(default_factory=list)
+    frames: list[FrameBytes] = field(default_factory=list)
     timescale_ns: int = 1_000_000
     complete: bool = True
 
@@ -219,7 +219,7 @@ def _cluster(data: memoryview, start: int, end: int, out: Matroska, place: objec
             raise ScanError(f"more than {MAX_FRAMES} frames", place=place)
 
 
-def _block(data: memoryview, s: int, e: int, cluster_time: int, scale_ns: int, place: object) -> Frame:
+def _block(data: memoryview, s: int, e: int, cluster_time: int, scale_ns: int, place: object) -> FrameBytes:
     """Track, signed 16-bit time relative to the cluster, flags; lacing is not used by recorders of images."""
     track, at = _vint(data, s, e, keep_marker=False)
     if track is None or at + 3 > e:
@@ -227,4 +227,4 @@ def _block(data: memoryview, s: int, e: int, cluster_time: int, scale_ns: int, p
     relative = int.from_bytes(data[at : at + 2], "big", signed=True)
     if data[at + 2] & 0x06:
         raise ScanError("laced blocks are not supported", place=place)
-    return Frame(track, (cluster_time + relative) * scale_ns, at + 3, e - at - 3)
+    return FrameBytes(track, (cluster_time + relative) * scale_ns, at + 3, e - at - 3)

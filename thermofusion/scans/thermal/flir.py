@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from ...errors import ScanError
 from ...files.reading import MAX_PIXELS, claimed_size, read_bytes
+from ...physics.band import ZERO_DEGC_K
 from ...types import Scan, SignalCurve
 from ..native.compose import ThermalFrames
 
 _RAW, _CAMERA = 0x01, 0x20
 _MAGIC = b"FFF\0"
-ZERO_DEGC_K = 273.15
 
 
 @dataclass(frozen=True)
