@@ -66,7 +66,7 @@ class SubjectFrames:
 
 
 def find_floor(depth_m: Float32, rays: Float32) -> Float | None:
-    """The floor (4,) `[n, d]` in a depth image (H, W) m, or None: n·p + d is the height in m of a point of the camera's
+    """The floor (4,) `[n, d]` in depth_m (H, W), or None: n·p + d is the height in m of a point of the camera's
     frame above it. rays : (H, W, 3) directions with z = 1. Looked for on a grid of pixels (see `floor_in_view`).
     """
     step = max(1, round(depth_m.shape[1] / GRID))
@@ -148,5 +148,5 @@ def static_scene(frames: DepthFrames) -> Float32:
 
 
 def static_tolerance(depth_m: Float32) -> Float32:
-    """Within this of the standing room a pixel shows the room, metres."""
+    """(H, W) m: within this of the standing room, `depth_m` (H, W) m, a pixel shows the room."""
     return np.float32(STATIC_SPREAD_AT_1M) * np.maximum(depth_m, np.float32(0.5)) ** 2

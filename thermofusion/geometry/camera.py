@@ -15,7 +15,10 @@ from ..types import Camera, Float
 
 
 def distort(x: NDArray, y: NDArray, distortion: Float) -> tuple[NDArray, NDArray]:
-    """Ideal image-plane coordinates (z = 1) to distorted ones; OpenCV's rational + tangential model (Eqs. 6-7)."""
+    """Ideal image-plane coordinates (z = 1) to distorted ones; OpenCV's rational + tangential model (Eqs. 6-7).
+
+    x, y : any shape, positions on the plane z = 1. distortion : (5,) or (8,), see `Camera`.
+    """
     k1, k2, p1, p2, k3 = distortion[:5]
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -27,7 +30,10 @@ def distort(x: NDArray, y: NDArray, distortion: Float) -> tuple[NDArray, NDArray
 
 
 def undistort(x_d: NDArray, y_d: NDArray, distortion: Float, *, iterations: int = 30) -> tuple[NDArray, NDArray]:
-    """Inverse of `distort` by fixed-point iteration with a Newton-like scale; NaN where it does not converge."""
+    """Inverse of `distort` by fixed-point iteration with a Newton-like scale; NaN where it does not converge.
+
+    x_d, y_d : any shape, positions on the plane z = 1. distortion : (5,) or (8,), see `Camera`.
+    """
     x, y = np.array(x_d, np.float64), np.array(y_d, np.float64)
     if not np.any(distortion):
         return x, y
@@ -41,9 +47,10 @@ def undistort(x_d: NDArray, y_d: NDArray, distortion: Float, *, iterations: int 
 
 
 def max_image_radius(distortion: Float) -> float:
-    """Largest ideal radius r up to which the radial model is increasing.
+    """Largest ideal radius r (z = 1, dimensionless) up to which the radial model is increasing; inf without distortion.
 
-    Beyond it a barrel-distorted model folds back: points far outside the field of view would land *inside* the image.
+    distortion : (5,) or (8,). Beyond r a barrel-distorted model folds back: points far outside the field of view would
+    land *inside* the image.
     """
     if not np.any(distortion):
         return np.inf
@@ -67,7 +74,10 @@ def project(camera: Camera, points: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def pixel_rays(camera: Camera, u_px: NDArray | None = None, v_px: NDArray | None = None) -> Float:
-    """Unit direction of each pixel's own ray in the camera's frame, (..., 3); the whole image (H, W, 3) by default."""
+    """Unit direction of each pixel's own ray in the camera's frame, (..., 3).
+
+    u_px, v_px : (...), image positions; without them the whole image, (H, W, 3).
+    """
     if u_px is None or v_px is None:
         u_px, v_px = np.meshgrid(
             np.arange(camera.width_px, dtype=np.float64), np.arange(camera.height_px, dtype=np.float64)
@@ -82,6 +92,7 @@ def pixel_rays(camera: Camera, u_px: NDArray | None = None, v_px: NDArray | None
 def viewing_cosine(points: NDArray, normals: NDArray, eye: NDArray) -> NDArray:
     """Cosine of the viewing angle: between the unit normal and the ray from the surface to the eye, (N,).
 
+    points : (N, 3) m. normals : (N, 3) unit. eye : (3,) m.
     The pixel's own ray, not the camera axis of the paper's Eq. 28; negative for back faces.
     """
     d = eye.astype(points.dtype) - points

@@ -129,7 +129,7 @@ def held_up(roll_deg: float) -> list[float]:
 
 
 def thermal_rig(rig: RigConfig, rng: np.random.Generator) -> tuple[Float, Float]:
-    """(true, written) T_thermal_depth: they differ by the scene's calibration error in a random direction."""
+    """(true, written) T_thermal_depth, (4, 4) m: they differ by the calibration error in a random direction."""
     true = se3_exp(THERMAL_TWIST)
     axes = rng.standard_normal((2, 3))
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
@@ -138,5 +138,5 @@ def thermal_rig(rig: RigConfig, rng: np.random.Generator) -> tuple[Float, Float]
 
 
 def color_rig() -> Float:
-    """True T_color_depth."""
+    """True T_color_depth, (4, 4) m."""
     return se3_exp(COLOR_TWIST)

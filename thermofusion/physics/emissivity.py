@@ -70,11 +70,11 @@ class EmissivityModel:
         return float(self(1.0))
 
     def relative(self, cos_theta: ArrayLike) -> Float:
-        """E(θ) = ε(θ)/ε(0), all that overlapping views can see of ε."""
+        """E(θ) = ε(θ)/ε(0) at cosines of any shape, dimensionless: all that overlapping views can see of ε."""
         return np.asarray(self(cos_theta) / self.normal)
 
     def derivative(self, theta_rad: ArrayLike) -> Float:
-        """dε/dθ in rad-1, by central difference (1e-9)."""
+        """dε/dθ in rad-1 at theta_rad of any shape, by central difference (1e-9)."""
         theta, h = np.asarray(theta_rad, np.float64), 1e-5
         return np.asarray((self(np.cos(theta + h)) - self(np.cos(theta - h))) / (2 * h))
 
@@ -207,7 +207,10 @@ def follows_shape(model: EmissivityModel) -> bool:
 
 
 def shape_direction(cos_theta: ArrayLike) -> Float:
-    """D(θ) = E of n = 1.33 + 0.25i less E of n = 1.33: the way in which shapes of ε(θ) of skin differ. D(0) = 0."""
+    """D(θ) = E of n = 1.33 + 0.25i less E of n = 1.33, at cosines of any shape, dimensionless.
+
+    The way in which shapes of ε(θ) of skin differ. D(0) = 0.
+    """
     return np.asarray(Fresnel(1.33, 0.25).relative(cos_theta) - Fresnel(1.33).relative(cos_theta))
 
 
@@ -266,14 +269,14 @@ class AngleTable:
 
     @classmethod
     def of(cls, function: EmissivityModel | NDArray, dtype: DTypeLike = np.float32) -> AngleTable:
-        """From a callable of cosθ, or its values at `AngleTable.knots()`; `dtype` is the float type of the answers."""
+        """From a callable of cosines, or its values (K,) at `AngleTable.knots()`; `dtype` is that of the answers."""
         values = function(cls.knots()) if callable(function) else function
         v = np.append(np.asarray(values, np.float64), values[-1])
         return cls(v[:-1].astype(dtype), np.diff(v).astype(dtype))
 
     @staticmethod
     def knots() -> Float:
-        """Cosines 0..1 at which the table is exact."""
+        """(K,) cosines 0..1 at which the table is exact."""
         return np.linspace(0, 1, LOOKUP_KNOTS)
 
     def __call__(self, cos_theta: NDArray) -> NDArray:

@@ -89,7 +89,10 @@ class SignalConverter:
 
 
 def counts_to_kelvin(signal: SignalCurve, counts: Float) -> Float:
-    """Apparent temperature of counts through the camera's curve, K; NaN where the curve gives none (paper Eq. 1)."""
+    """Apparent temperature of counts, any shape, through the camera's curve, K (paper Eq. 1).
+
+    NaN where the curve gives none. Raises ScanError for an incomplete or unknown curve.
+    """
     p, place = signal.parameters, "cameras.thermal.signal.curve"
     try:
         with np.errstate(all="ignore"):

@@ -114,12 +114,15 @@ def cast_mesh(
 
 
 def cast_surface(surface: SurfaceMesh, axes: Float, *, height_px: int = 900) -> list[Cast]:
-    """The same before there are temperatures. axes : (3, 3), rows right, up and front (`export.axes_of`)."""
+    """The same before there are temperatures. axes : (3, 3) unit rows right, up and front (`export.axes_of`)."""
     return cast_views(surface, axes, height_px - _Page(height_px).chrome_px)
 
 
 def draw(casts: list[Cast], values: NDArray, scale: Scale, *, height_px: int) -> dict[str, UInt8]:
-    """One page per view, and `overview` with all of them side by side under one bar."""
+    """One page (H, W, 3) sRGB per view, and `overview` with all of them side by side under one bar.
+
+    values : (V,) in the scale's unit, NaN = unmeasured.
+    """
     finite = values[np.isfinite(values)]
     beyond = bool((finite < scale.lo).any()), bool((finite > scale.hi).any())
     legend = ["unmeasured"] if len(finite) < len(values) else []

@@ -35,7 +35,11 @@ def make_stream(
     index: Sequence[int] | NDArray | None = None,
     usable: Sequence[bool] | NDArray | None = None,
 ) -> Stream:
-    """A stream whose times were checked: finite and strictly rising, at least one."""
+    """A stream whose times were checked: finite and strictly rising, at least one.
+
+    times_s : (N,) s. load : i -> image (H, W) or (H, W, 3), as `Stream.load`. index : (N,) the recording's own numbers;
+    None = 0, 1, 2 ... usable : (N,) mask; None = all. Raises ScanError.
+    """
     t = np.asarray(times_s, np.float64)
     numbers = np.arange(len(t)) if index is None else np.asarray(index, np.int64)
     if len(t) == 0:
@@ -98,7 +102,10 @@ def image_stream(
 
 
 def as_loaded(kind: Kind, raw: NDArray, place: object, unit_m: float, invalid: tuple[int, ...] = (0,)) -> NDArray:
-    """A decoded image in the form that `Stream.load` promises for its kind."""
+    """A decoded image in the form that `Stream.load` promises for its kind; raw : (H, W), or (H, W, 3) B, G, R uint8.
+
+    unit_m, invalid : of 16-bit depth. Raises ScanError for pixels of another type.
+    """
     if kind == "depth":
         return depth_from_raw(raw, unit_m, place=place, invalid=invalid)
     if kind == "thermal":
@@ -140,7 +147,7 @@ def image_size(path: Path, kind: str) -> tuple[int, int]:
 def make_camera(
     width_px: int, height_px: int, K: NDArray, distortion: NDArray | None = None, *, place: object
 ) -> Camera:
-    """A `Camera`, its faults as ScanError with the place."""
+    """A `Camera` of K (3, 3) px and distortion (5,) or (8,), None = none; its faults as ScanError with the place."""
     try:
         return Camera(width_px, height_px, K, np.zeros(5) if distortion is None else distortion)
     except (ValueError, TypeError) as e:
@@ -169,5 +176,5 @@ def as_thermal(stream: Stream, camera: ThermalCamera) -> ThermalStream:
 
 
 def frame_times(numbers: Sequence[int]) -> Float:
-    """Times of frames that carry only numbers, at the assumed rate."""
+    """Times (N,) in s of frames that carry only numbers, at the assumed rate."""
     return np.asarray(numbers, np.float64) / ASSUMED_RATE_HZ

@@ -43,7 +43,8 @@ class Frames(Protocol):
 
     camera: Camera
 
-    def read_ahead(self, frames: Sequence[int]) -> Iterator[tuple[int, Float32]]: ...
+    def read_ahead(self, frames: Sequence[int]) -> Iterator[tuple[int, Float32]]:
+        """(i, depth (H, W) m of frame i) in the order given."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +100,7 @@ def survey_depth(scan: Scan, frames: Frames, poses: FramePoses) -> Survey:
 
 
 def depth_noise(images: tuple[Float32, ...] | list[Float32]) -> float:
-    """Depth noise, one sigma in metres at 1 m, growing with range² as a triangulating camera's does.
+    """Depth noise of images (H, W) m, one sigma in metres at 1 m, growing with range² as a triangulating camera's does.
 
     From third differences over 3 px, in which neither slope nor curvature of the surface is left, and noise that is
     correlated over a pixel or two is whole: -z(u) + 3 z(u+3) - 3 z(u+6) + z(u+9) has variance 20 σ². Median absolute
@@ -219,15 +220,18 @@ class VoxelGrid:
         return int(self._grid.hashmap().size())
 
     def touch(self, depth_m: Float32, T_world_depth: Float) -> NDArray[np.int32]:
-        """(N, 3) coordinates of the blocks within the truncation of a frame's surface."""
+        """(N, 3) coordinates, in blocks, of what is within the truncation of a frame's surface.
+
+        depth_m : (H, W), NaN = none. T_world_depth : (4, 4).
+        """
         depth = self._depth(depth_m)
         return self._blocks(depth, self._o3d.core.Tensor(invert(T_world_depth))).numpy()
 
     def integrate(self, depth_m: Float32, T_world_depth: Float) -> bool:
-        """Average a frame into the field. False, with the field unchanged, if that needs more blocks than allowed.
+        """Average a frame, depth_m (H, W) at T_world_depth (4, 4), into the field.
 
-        The table is enlarged before the blocks go in: one that overflows while they do loses blocks, and the surface
-        gets holes.
+        False, with the field unchanged, if that needs more blocks than allowed. The table is enlarged before the blocks
+        go in: one that overflows while they do loses blocks, and the surface gets holes.
         """
         depth, extrinsic = self._depth(depth_m), self._o3d.core.Tensor(invert(T_world_depth))
         blocks, table = self._blocks(depth, extrinsic), self._grid.hashmap()
@@ -244,7 +248,7 @@ class VoxelGrid:
         return True
 
     def extract(self, min_weight: float) -> tuple[Float32, NDArray[np.int32]]:
-        """Vertices (V, 3) and triangles (F, 3) of the zero level where it was seen at least `min_weight` times."""
+        """Vertices (V, 3) m and triangles (F, 3) of the zero level where it was seen at least `min_weight` times."""
         if self.blocks == 0:
             return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)
         try:  # Open3D wants weights *above* its threshold; they are whole numbers here.

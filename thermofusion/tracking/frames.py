@@ -128,7 +128,10 @@ def _probes(scan: Scan) -> list[int]:
 
 
 def coarse_depth(depth_m: Float32, step: int) -> Float32:
-    """Mean depth over cells of `step` x `step` pixels, NaN where less than half is valid or two surfaces meet."""
+    """Mean of depth_m (H, W) over cells of `step` x `step` pixels: (H // step, W // step) m.
+
+    NaN where less than half of a cell is valid or two surfaces meet.
+    """
     if step == 1:
         return depth_m
     h, w = (n // step * step for n in depth_m.shape)
@@ -145,7 +148,7 @@ def coarse_depth(depth_m: Float32, step: int) -> Float32:
 
 
 def local_contrast(grey: Float32, step: int) -> Float32:
-    """(I - local mean) / local spread of an image reduced by `step`: what light and exposure leave unchanged."""
+    """(I - local mean) / local spread of `grey` (H, W) reduced by `step`: what light and exposure leave unchanged."""
     size = (grey.shape[1] // step, grey.shape[0] // step)
     image = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     window = (TEXTURE_WINDOW_PX, TEXTURE_WINDOW_PX)

@@ -73,7 +73,7 @@ def overlapping(
 ) -> list[tuple[int, int]]:
     """Pairs (source, target) of maps that see the same surface: neighbours in the list, and the best others.
 
-    Each map keeps about `per_map` overlaps of at least `min_share` of its points.
+    poses : (F, 4, 4) T_world_map. Each map keeps about `per_map` overlaps of at least `min_share` of its points.
     """
     axis = poses[:, :3, 2]
     near = axis @ axis.T > np.cos(np.radians(max_turn_deg))

@@ -84,11 +84,9 @@ class GrowingSegment:
         """Append a frame if the motion to it can be believed."""
         if frame.index - self._frames[-1] > MAX_GAP_FRAMES:
             return False
-        dt_s = max(frame.time_s - self._last.time_s, 1e-3)
+        dt_s, last = max(frame.time_s - self._last.time_s, 1e-3), [(self._last.map, np.eye(4))]
         for start, reaches in ((se3_exp(self._velocity * dt_s), REACHES_M), (np.eye(4), RESCUE_REACHES_M)):
-            T_last_now, _ = register_view(
-                frame.map, [(self._last.map, np.eye(4))], start, reaches, tolerance=STEP_TOLERANCE
-            )
+            T_last_now, _ = register_view(frame.map, last, start, reaches, tolerance=STEP_TOLERANCE)
             partners = find_partners(frame.map, self._last.map, T_last_now, REACH_M)
             believed = _believed(partners, self._tracking) and _possible(T_last_now, dt_s)
             if believed and agreement(frame.map, self._last.map, T_last_now, stride=2) >= MIN_AGREEMENT:
@@ -98,8 +96,10 @@ class GrowingSegment:
         return False
 
     def append_at(self, frame: TrackingFrame, T: Float) -> None:
-        """Append a frame whose pose is known from elsewhere (a recorded trajectory). Within a fragment its motion is
-        still measured: recorded poses may jitter."""
+        """Append a frame whose pose T (4, 4), frame to segment [m], is known from elsewhere (a recorded trajectory).
+
+        Within a fragment its motion is still measured: recorded poses may jitter.
+        """
         start, last = invert(self._T[-1]) @ T, [(self._last.map, np.eye(4))]
         T_last_now, _ = register_view(frame.map, last, start, REACHES_M[1:], tolerance=STEP_TOLERANCE)
         partners = find_partners(frame.map, self._last.map, T_last_now, REACH_M)

@@ -73,7 +73,7 @@ def read_shelf(path: Path, *, registered: bool) -> Scan:
 
 
 def decode_depth(data: bytes, place: object) -> NDArray[np.uint16]:
-    """A shelf PNG's values, rotated back: 0.1 mm, 0 = none."""
+    """A shelf PNG's values (H, W), rotated back: numbers of 0.1 mm, 0 = none."""
     v = decode_image(data, shape=None, kind="depth", place=place)
     if v.dtype != np.uint16 or v.ndim != 2:
         raise ScanError(f"depth is {v.dtype} with {v.ndim} axes, expected 16-bit grey", place=place)

@@ -97,7 +97,7 @@ def read(path: Path) -> Scan:
 
 
 def decode_b16g(data: bytes, shape: tuple[int, int], place: object) -> NDArray[np.uint16]:
-    """Big-endian 16-bit grey without header."""
+    """Big-endian 16-bit grey (H, W) without header. Raises ScanError for another length."""
     h, w = shape
     if len(data) != 2 * h * w:
         raise ScanError(f"a frame has {len(data)} bytes, expected {2 * h * w} of {w} x {h} b16g", place=place)
@@ -105,7 +105,7 @@ def decode_b16g(data: bytes, shape: tuple[int, int], place: object) -> NDArray[n
 
 
 def azure_camera(calibration: Any, which: str, width_px: int, height_px: int, place: object) -> tuple[Camera, Float]:
-    """A camera for images of that size, and its pose T_camera_reference (metres), from the device's calibration.
+    """A camera for images of that size, and its pose T_camera_reference (4, 4) m, from the device's calibration.
 
     Intrinsics are stored in units of the whole image with the origin at the first pixel's *corner*. Distortion order
     there: k1..k6, codx, cody, p2, p1 (Brown-Conrady rational model, as OpenCV's).

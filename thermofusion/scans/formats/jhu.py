@@ -123,7 +123,7 @@ def _thermal(
 
 
 def decode_counts(data: bytes, place: object) -> NDArray[np.uint16]:
-    """A headerless frame of big-endian counts."""
+    """A headerless frame (H, W) of big-endian counts. Raises ScanError for another length."""
     h, w = THERMAL_SHAPE
     if len(data) != 2 * h * w:
         raise ScanError(f"expected {2 * h * w} bytes of {w} x {h} counts, got {len(data)}", place=place)
