@@ -32,7 +32,7 @@ _POLYLINES = {
 }
 PALETTES: tuple[str, ...] = get_args(PaletteName)  # what a recipe may name
 WARNINGS = {"rainbow": "the rainbow palette shows edges that are not in the data; use it only to match older pictures"}
-UNMEASURED_RGB = (168, 168, 168)
+UNMEASURED_RGB = (168, 168, 168)  # sRGB: a grey that no coloured palette holds
 UNMEASURED_ON_GREY_RGB = (96, 128, 176)  # the grey and cividis palettes pass through grey: unmeasured skin is bluish
 DEFAULT_RANGE_DEGC = (20.0, 40.0)  # where nothing is measured
 

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from ..types import Float
 
 # CODATA 2018, exact
-PLANCK_H = 6.62607015e-34
-LIGHT_C = 299792458.0
-BOLTZMANN = 1.380649e-23
+PLANCK_H = 6.62607015e-34  # J s
+LIGHT_C = 299792458.0  # m/s
+BOLTZMANN = 1.380649e-23  # J/K
 
 QUADRATURE_NODES = 48  # Gauss-Legendre over the band: Planck is smooth, the error is far below 1e-9
 TABLE_STEP_K = 0.02  # linear interpolation between table nodes errs by less than 1 µK
-TABLE_RANGE_DEGC = (-60.0, 200.0)
+TABLE_RANGE_DEGC = (-60.0, 200.0)  # of the table; outside it the ends' values hold
 
 
 @dataclass(frozen=True, eq=False)

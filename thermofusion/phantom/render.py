@@ -19,7 +19,7 @@ from .skin import Covering
 
 RAY_START_M = 2e-4  # a ray that leaves a surface starts this far from it
 MARGIN_PX = 12  # around the subject's outline, for lens distortion and breathing
-FLOOR_EPSILON = 0.95
+FLOOR_EPSILON = 0.95  # emissivity of the floor, at every angle
 UNDISTORT_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-9)  # pixels
 
 

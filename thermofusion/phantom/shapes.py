@@ -23,7 +23,7 @@ SHOULDER = np.array([0.185, 0.005, 1.390])
 ELBOW = np.array([0.360, 0.005, 1.215])
 WRIST = np.array([0.488, -0.205, 1.075])
 HIP = np.array([0.095, 0.010, 0.900])
-NECK_Z = 1.455
+NECK_Z = 1.455  # m, height of the cut below the head
 
 
 @dataclass(frozen=True, eq=False)

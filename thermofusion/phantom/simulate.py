@@ -32,7 +32,7 @@ from .walk import Motion, color_rig, held_up, thermal_rig
 from .writing import camera_json, whole_folder, write_frames, write_image, write_json, write_trajectory
 
 BREATH_LEVELS = 12  # the breathing surface is cast in so many steps: 0.4 mm apart for 5 mm
-COLOR_DISTORTION = (0.045, -0.11, 0.0007, -0.0009, 0.03)
+COLOR_DISTORTION = (0.045, -0.11, 0.0007, -0.0009, 0.03)  # k1 k2 p1 p2 k3
 
 # one random stream for each purpose: adding a colour camera must not change the thermal noise
 SEED_SKIN, SEED_EXCHANGE, SEED_MOTION, SEED_RIG, SEED_DRIFT, SEED_DEPTH, SEED_THERMAL, SEED_TEXTURE = range(8)

@@ -18,7 +18,7 @@ from .depth_cameras import scaled_camera
 from .physics import Band
 from .scene import BlackbodyConfig, DriftConfig, ThermalConfig
 
-LWIR_DISTORTION = (-0.24, 0.11, 0.0011, -0.0006, -0.02)
+LWIR_DISTORTION = (-0.24, 0.11, 0.0011, -0.0006, -0.02)  # k1 k2 p1 p2 k3: a wide lens's barrel
 REFERENCE_DEGC = 30.0  # NETD, drift and vignetting are given in kelvin at this temperature (the makers' convention)
 BLACKBODY_MARGIN = 1.5  # the source is this much larger than the polygon, so that blur does not reach into it
 SHUTTER_DEGC = 28.0  # a shutter has about the housing's temperature

@@ -13,7 +13,7 @@ from .scene import MotionConfig, RigConfig, WalkConfig
 
 TREMOR_HZ = (0.4, 6.0)  # physiological tremor of an outstretched arm, and the walker's gait
 SWAY_HZ = (0.1, 0.6)  # quiet standing
-MOTION_WAVES = 12
+MOTION_WAVES = 12  # sines a component
 
 # The rig's true extrinsics: the thermal camera above the depth camera, colour beside it.
 THERMAL_TWIST = np.array([-0.05, 0.02, 0.01, 0.018, -0.100, 0.011])

@@ -14,14 +14,14 @@ from numpy.typing import ArrayLike
 
 from ..types import Float
 
-ZERO_DEGC_K = 273.15
+ZERO_DEGC_K = 273.15  # K at 0 °C, by definition
 _H, _C, _K = 6.62607015e-34, 299792458.0, 1.380649e-23  # CODATA 2018, exact: J s, m/s, J/K
 _C1 = 2 * _H * _C**2  # W m2 sr-1
 _C2 = _H * _C / _K  # m K
 
 TABLE_K = (150.0, 1500.0)  # temperatures a band's table covers; NaN outside
-_STEP_K = 0.5
-_KNOTS = 4096
+_STEP_K = 0.5  # between a table's knots: cubics err by less than 1e-7 of the radiance
+_KNOTS = 4096  # of the inverse table: cubics err by less than 1e-6 K
 _NODES = 64  # Gauss-Legendre: exact to rounding for any thermal band
 
 

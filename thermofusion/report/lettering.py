@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..export.palettes import table
 from ..types import UInt8
 
-INK, QUIET = (34, 34, 38), (110, 110, 116)
+INK, QUIET = (34, 34, 38), (110, 110, 116)  # sRGB of letters and lines, and of what stands back
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 _FINE = 4  # letters are drawn this much larger, then averaged down: smooth at any size
 _STROKES = cv2.__version__.startswith("4")  # OpenCV 4 draws letters with a pen; from 5 on they are outlines

@@ -25,7 +25,7 @@ from .lettering import INK, QUIET, Scale
 
 UNMEASURED_RGB = ((226, 226, 226), (190, 190, 190))  # stripes falling to the left,
 INSIDE_RGB = ((112, 112, 112), (84, 84, 84))  # and to the right: no palette can be mistaken for either
-OUTLINE_RGB, OUTLINE_ALPHA = (40, 40, 44), 0.75
+OUTLINE_RGB, OUTLINE_ALPHA = (40, 40, 44), 0.75  # sRGB and opacity of the line round contours
 CREASE_PX = 10.0  # a step in depth of this many pixels is an edge: a slope of 84° is none
 _LABELS = {"front": "front (toward the first camera)"}
 

@@ -14,10 +14,10 @@ from ..geometry.rigid import interpolate_trajectory, invert, transform_points
 from ..types import Bool, Camera, Float, Scan, Stream, UInt8
 from .pairing import nearest_in_time
 
-OVERLAY_FRAMES = 3
+OVERLAY_FRAMES = 3  # spread through the recording
 EDGE_STEP = 0.03  # a neighbour farther away by this share of the range makes an edge
 REACH_PX = 12  # shifts tried
-_GREEN = (0, 255, 0)
+_GREEN = (0, 255, 0)  # sRGB: no grey, no skin
 
 
 @dataclass(frozen=True, eq=False)

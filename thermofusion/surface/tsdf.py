@@ -32,9 +32,9 @@ TRUNCATION_PER_NOISE = 3.5  # noise is averaged, not cut; what is thinner than t
 FAR_NOISE_PER_TRUNCATION = 0.5  # depth noisier than this share of the truncation would only blur
 FAR_PER_MEDIAN = 1.3  # but nothing nearer than this share of the median range is given up
 MIN_TRUNCATION_VOXELS, MIN_TRUNCATION_M = 2.5, 8e-3  # poses are rarely better than 2 mm
-MAX_VOXEL_M = 0.1
-ESTIMATE_MARGIN = 1.1
-TOUCH_STRIDE_PX, TOUCHES_PER_BLOCK = 4, 3
+MAX_VOXEL_M = 0.1  # larger ones hold no body: then the memory allowed is refused
+ESTIMATE_MARGIN = 1.1  # of the estimated blocks: the table should not have to grow
+TOUCH_STRIDE_PX, TOUCHES_PER_BLOCK = 4, 3  # Open3D looks along every fourth ray; three through a block find it
 GROWTH = 1.3  # of the block table, each time it is full
 
 

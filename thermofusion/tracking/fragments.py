@@ -13,7 +13,7 @@ from ..types import Float, Float32
 from .frames import TrackingFrame
 from .maps import DepthMap, Intrinsics
 
-SAMPLES = 4000
+SAMPLES = 4000  # points of a fragment that are sent to other views
 SAME_SURFACE_M = 0.02  # depth this far behind the nearest is another surface
 MIN_SEEN_SHARE = 1 / 3  # of the frames that must see a pixel
 

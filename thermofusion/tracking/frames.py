@@ -24,7 +24,7 @@ MIN_VALID_SHARE = 0.01  # a frame with fewer valid pixels shows nothing
 CELL_SPREAD = 0.03  # relative: pixels of one cell that differ more see two surfaces
 TEXTURE_WINDOW_PX = 15  # of the coarse colour image: intensity is what differs from the mean over this
 CONTRAST_FLOOR = 3.0  # grey levels of local contrast below which texture fades to nothing
-PROBES = 5
+PROBES = 5  # frames that tell distance and shape beforehand
 NEAR_M = 0.7  # nearer subjects are zoomed to 1 m: they are small, and so must every distance be that matters
 SLIDES_BELOW = 0.1  # `stiffness_of` cylinders, spheres and bowls is 0.06 (what noise pretends), of bodies 0.13 to 0.35
 

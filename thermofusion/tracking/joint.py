@@ -13,7 +13,7 @@ from .maps import DepthMap
 from .registration import MIN_PARTNERS, find_partners, normal_equations, shape_weights
 
 GOOD_SHARE = 0.4  # of a map's points: smaller overlaps, seen obliquely, serve where there are few better ones
-CONVERGED = 1e-4  # rad and m: a tenth of a millimetre, a tenth of a voxel
+CONVERGED = 1e-4  # rad and m: far below a voxel
 LOOP_APART = 3  # maps this far apart in time that overlap close a loop
 
 

@@ -16,13 +16,14 @@ from .frames import TrackingFrame, TrackingFrames
 from .maps import DepthMap, Intrinsics
 from .registration import REACH_M, Partners, agreement, find_partners, register_view
 
+# Reach of partners, one iteration each: from what a fast walk moves in a frame down to what noise spreads.
 REACHES_M = (0.08, 0.05, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03)
 # A second try from standing still, with a far reach: for a jerk that the last motion did not announce.
 RESCUE_REACHES_M = (0.15, 0.15, 0.12, 0.12, 0.1, 0.1, 0.08, 0.06, 0.05, 0.04, 0.03, 0.03, 0.03, 0.03)
 STEP_TOLERANCE = 2e-5  # rad and m: well below what one frame's noise allows
 MIN_AGREEMENT = 0.75  # of what both frames could see, outlines included; neighbours have 0.86 to 1
 MAX_SPEED_M_S, MAX_SPEED_DEG_S = 2.5, 180.0  # faster is no walk: a failure
-MIN_STEP_M, MIN_STEP_DEG = 0.06, 6.0
+MIN_STEP_M, MIN_STEP_DEG = 0.06, 6.0  # always possible, however near in time two frames stand
 MAX_GAP_FRAMES = 5  # empty frames that a segment may step over
 
 

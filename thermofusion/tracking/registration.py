@@ -19,8 +19,8 @@ from ..types import Float
 from .maps import DepthMap
 
 MAX_NORMAL_DEG = 45.0  # partners must face alike
-MIN_PARTNERS = 150
-NOISE_FLOOR_M = 3e-4
+MIN_PARTNERS = 150  # a twentieth of a frame's points: fewer fix no pose
+NOISE_FLOOR_M = 3e-4  # at 1 m: no spread of residuals is believed to be smaller
 REACH_M = 0.05  # of the partners that judge a motion
 INTENSITY_FLOOR = 0.05  # of the normalised intensity, whose local spread is about 1
 

@@ -18,18 +18,20 @@ from .fragments import Fragment
 from .maps import DepthMap
 from .registration import REACH_M, register_view, seen_from
 
+# Reach of partners, one iteration each.
 COARSE_REACHES_M = (0.2, 0.16, 0.13, 0.1, 0.08, 0.06, 0.05, 0.04)
 FINE_REACHES_M = (0.04, 0.03, 0.03, 0.02, 0.02, 0.02)
+# Walks round the subject that are tried, both ways, near ones first.
 TURNS_DEG = (15, -15, 30, -30, 45, -45, 60, -60, 75, -75, 90, -90, 110, -110, 130, -130, 150, -150, 170, -170)
-MAX_PLACES = 24
+MAX_PLACES = 24  # tried, evenly spread over the fragments: every 15 degrees of a walk round
 FEATURE_VOXELS = 25  # over the subject's extent: a few per cent of it
-RANSAC_ITERATIONS = 60_000
-TARGETS = 3
-SHORTLIST = 6
+RANSAC_ITERATIONS = 60_000  # at most: it ends earlier once 0.999 sure
+TARGETS = 3  # fragments that a hypothesis is aligned with
+SHORTLIST = 6  # hypotheses that are aligned finely
 MIN_SHARED = 0.2  # of the points sent: a join on less is a guess
 MIN_AGREEMENT = 0.85  # right places up to 50 degrees apart have 0.86 to 1, the best wrong ones up to 0.82
 MARGIN = 0.05  # by which another place must agree less
-SAME_PLACE_M, SAME_PLACE_DEG = 0.06, 8.0
+SAME_PLACE_M, SAME_PLACE_DEG = 0.06, 8.0  # hypotheses nearer to each other than this are one
 
 Placed = tuple[Fragment, Float]  # and the pose of its middle frame
 

@@ -29,10 +29,10 @@ from .registration import register_view
 from .relocalise import find_join
 
 ROUNDS = ((0.08, 4), (0.03, 2), (0.015, 1))  # of the joint solution: reach of partners in m, every how many points
-PARTNERS_PER_FRAGMENT = 8
+PARTNERS_PER_FRAGMENT = 8  # overlaps kept of each, about
 MIN_OVERLAP = 0.2  # of a fragment's points
-FRAME_REACHES_M = (0.02, 0.015, 0.01)
-FRAME_TARGETS = 3
+FRAME_REACHES_M = (0.02, 0.015, 0.01)  # reach of partners, one iteration each
+FRAME_TARGETS = 3  # fragments, the nearest, that a frame is aligned with
 SPEED_FRAMES = 5  # over which the motion before a break is taken
 MIN_FLOOR_SHARE = 0.05  # of frames that must show a floor for it to count as found
 

@@ -18,7 +18,7 @@ from ...files.tum import poses_to_trajectory
 from ...types import Float, Scan
 from ..common import ImageFiles, frame_times, image_size, image_stream, make_camera, make_rig, numbered
 
-UNIT_M = 1e-4
+UNIT_M = 1e-4  # the recorder's unit of depth, 0.1 mm
 # Found by predicting registered from raw depth (tests/test_scans.py): without the extrinsic's 4.3 mm along z the two
 # agree to 0.6 mm, with it to 4.1 mm.
 NOT_MOVED = "registered depth was moved to colour's pixels but keeps the depth camera's z: 4.3 mm less than colour's"

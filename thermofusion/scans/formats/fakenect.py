@@ -23,10 +23,10 @@ from ...geometry.rigid import pose
 from ...types import Float, Scan
 from ..common import ImageFiles, image_stream, make_camera, make_rig
 
-TICK_HZ = 60e6
-TICK_WRAP = 2**32
-NO_DEPTH_RAW = 2047
-COUNTS_PER_G = 819.0
+TICK_HZ = 60e6  # of the Kinect's clock
+TICK_WRAP = 2**32  # ticks: the counter has 32 bits, 72 s
+NO_DEPTH_RAW = 2047  # 11 bits, all set
+COUNTS_PER_G = 819.0  # of the accelerometer, libfreenect's constant
 _NAME = re.compile(r"^([dra])-(\d+(?:\.\d+)?)-(\d{1,10})\.(pgm|ppm|dump)$")
 
 

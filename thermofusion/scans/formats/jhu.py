@@ -18,7 +18,7 @@ from ...geometry.rigid import pose
 from ...types import Camera, Float, Scan, SignalCurve, Stream, ThermalCamera, ThermalStream, Trajectory
 from ..common import ImageFiles, as_thermal, frame_times, image_stream, make_camera, make_rig, numbered
 
-THERMAL_SHAPE = (476, 632)
+THERMAL_SHAPE = (476, 632)  # (height, width), px: files have no header
 FAR_CLIP_MM = 3975  # the recorder's far clip: no measurement
 DEPTH_FOCAL_PX = 580.0  # nominal for a Kinect v1's depth camera; board planes say 576 ± 2
 # The face was recorded with the rig as it stood on another day. Fitted to that picture's own outline (shoulders and

@@ -17,7 +17,7 @@ from ...geometry.rigid import pose
 from ...types import Scan, Trajectory
 from ..common import ImageFiles, frame_times, image_size, image_stream, make_camera, make_rig, numbered
 
-INVALID = (0, 65535)
+INVALID = (0, 65535)  # raw depths that mean none
 PUBLISHED_K = np.array([[585.0, 0, 320], [0, 585.0, 240], [0, 0, 1]])
 # The Kinect v1's colour camera is not calibrated in this data set: OpenNI's focal length and the mechanical baseline.
 COLOR_K = np.array([[525.0, 0, 320], [0, 525.0, 240], [0, 0, 1]])

@@ -16,7 +16,7 @@ from ...files.tum import read_trajectory
 from ...types import Camera, Scan, Stream
 from ..common import NOMINAL_K, ImageFiles, Kind, image_size, image_stream, make_camera, make_rig
 
-UNITS_PER_METRE = 5000
+UNITS_PER_METRE = 5000  # of the benchmark's depth images
 # fx fy cx cy of the benchmark's three sensors, as its authors published them.
 PUBLISHED = {
     "freiburg1": (517.3, 516.5, 318.6, 255.3),

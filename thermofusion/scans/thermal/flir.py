@@ -23,7 +23,7 @@ from ...physics.band import ZERO_DEGC_K
 from ...types import Scan, SignalCurve
 from ..native.compose import ThermalFrames
 
-_RAW, _CAMERA = 0x01, 0x20
+_RAW, _CAMERA = 0x01, 0x20  # types of FFF records: raw image, camera's parameters
 _MAGIC = b"FFF\0"
 
 
