@@ -1,8 +1,4 @@
-"""The result folder: files that appear whole or not at all, and stages that are not computed twice.
-
-A stage's key is the hash of everything that goes into it: the scan's fingerprint, the recipe sections it reads, the
-program's version, and the key of the stage before. A stored artifact with the same key is taken as it is.
-"""
+"""JSON of anything the package holds: dataclasses, documents, arrays, paths."""
 
 from __future__ import annotations
 

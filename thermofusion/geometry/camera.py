@@ -1,7 +1,6 @@
-"""Rigid motions and the pinhole camera: pure NumPy (and SciPy's rotations).
+"""The pinhole camera: distortion, projection, pixel rays, viewing angles. Pure NumPy.
 
-Frames: `T_a_b` (4x4) takes a point from frame b to frame a, p_a = T_a_b p_b. Camera: x right, y down, z forward; the
-centre of the first pixel is (0, 0) (paper Eqs. 2-8, with OpenCV's coefficient order).
+x right, y down, z forward; the centre of the first pixel is (0, 0) (paper Eqs. 2-8, with OpenCV's coefficient order).
 """
 
 from __future__ import annotations
@@ -10,8 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..types import Camera, Float
-
-# ---------------------------------------------------------------- the camera
 
 
 def distort(x: NDArray, y: NDArray, distortion: Float) -> tuple[NDArray, NDArray]:

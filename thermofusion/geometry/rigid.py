@@ -1,7 +1,6 @@
-"""Rigid motions and the pinhole camera: pure NumPy (and SciPy's rotations).
+"""Rigid motions and trajectories: NumPy and SciPy's rotations.
 
-Frames: `T_a_b` (4x4) takes a point from frame b to frame a, p_a = T_a_b p_b. Camera: x right, y down, z forward; the
-centre of the first pixel is (0, 0) (paper Eqs. 2-8, with OpenCV's coefficient order).
+`T_a_b` (4x4) takes a point from frame b to frame a, p_a = T_a_b p_b.
 """
 
 from __future__ import annotations
@@ -11,8 +10,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..types import Bool, Float, Trajectory
-
-# ---------------------------------------------------------------- rigid motions
 
 
 def invert(T: Float) -> Float:

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from ..geometry._open3d import o3d
 from ..geometry.rigid import invert
 from ..types import Bool, Camera, Float, Float32
 from .physics import Band
@@ -27,10 +26,13 @@ class Caster:
     """Rays against one triangle mesh (Embree through Open3D)."""
 
     def __init__(self, vertices_m: NDArray, triangles: NDArray) -> None:
+        from ..geometry._open3d import o3d
+
+        self._tensor = o3d.core.Tensor
         self._scene = o3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(
-            o3d.core.Tensor(np.ascontiguousarray(vertices_m, np.float32)),
-            o3d.core.Tensor(np.ascontiguousarray(triangles, np.uint32)),
+            self._tensor(np.ascontiguousarray(vertices_m, np.float32)),
+            self._tensor(np.ascontiguousarray(triangles, np.uint32)),
         )
 
     def hits(self, origins: NDArray, directions: NDArray) -> tuple[Float32, NDArray[np.int64], Float32]:
@@ -40,7 +42,7 @@ class Caster:
         """
         origins = np.broadcast_to(origins, directions.shape)
         rays = np.concatenate([origins, directions], 1).astype(np.float32)
-        answer = self._scene.cast_rays(o3d.core.Tensor(rays))
+        answer = self._scene.cast_rays(self._tensor(rays))
         return (
             answer["t_hit"].numpy(),
             answer["primitive_ids"].numpy().astype(np.int64),
@@ -51,7 +53,7 @@ class Caster:
         """Mask (N,): something stands between origins (N, 3) m and targets, (3,) or (N, 3) m."""
         targets = np.broadcast_to(targets, origins.shape)
         rays = np.concatenate([origins, targets - origins], 1).astype(np.float32)
-        return self._scene.test_occlusions(o3d.core.Tensor(rays), 0.0, 1.0).numpy()
+        return self._scene.test_occlusions(self._tensor(rays), 0.0, 1.0).numpy()
 
 
 def corner_weights(uv: Float32) -> Float32:

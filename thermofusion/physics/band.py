@@ -1,4 +1,4 @@
-"""Signal, in-band radiance, temperature: the measurement equation, forwards and backwards.
+"""Planck in a camera's band: in-band radiance from temperature, and back, by tables.
 
 Inside the method everything is linear in in-band radiance L [W m-2 sr-1]; a temperature is computed once, at the end.
 Formulas, their sources and the golden values stand in docs/radiometry.md.

@@ -1,6 +1,5 @@
-"""Signal, in-band radiance, temperature: the measurement equation, forwards and backwards.
+"""The measurement equation, forwards and backwards, in in-band radiance; and the paper's own, in degrees Celsius.
 
-Inside the method everything is linear in in-band radiance L [W m-2 sr-1]; a temperature is computed once, at the end.
 Formulas, their sources and the golden values stand in docs/radiometry.md.
 """
 
@@ -10,8 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..types import Float
-
-# ---------------------------------------------------------------- the measurement equation
 
 
 def apparent_radiance(
