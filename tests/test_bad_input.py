@@ -20,9 +20,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support import scan_maker as make
+from support.scan_maker import write_pnm
 
 from thermofusion.errors import ScanError
-from thermofusion.files.pnm import read_pnm, write_pnm
+from thermofusion.files.pnm import read_pnm
 from thermofusion.files.reading import decode_image
 from thermofusion.scans import open_scan
 from thermofusion.scans.check import verify

@@ -109,14 +109,14 @@ def test_extinction_goes_smoothly_to_none():
 
 
 @pytest.mark.parametrize("model", [*SKIN.values(), Fresnel(2.84), Cosine(), Blackbody()], ids=str)
-def test_derivative_and_lookup(model):
+def test_derivative_and_table(model):
     theta = np.radians(np.arange(2, 86, 3))
     h = 1e-4
     at = [model(np.cos(theta + j * h)) for j in (-2, -1, 1, 2)]
     five_point = (at[0] - 8 * at[1] + 8 * at[2] - at[3]) / (12 * h)
     np.testing.assert_allclose(model.derivative(theta), five_point, atol=1e-8)
     c = np.random.default_rng(0).uniform(0.1, 1, 50_000)
-    table = model.lookup()
+    table = AngleTable.of(model)
     assert table(c).dtype == np.float32
     assert np.abs(table(c) - model(c)).max() < 5e-7
     assert table(np.array([1.0 + 1e-7])) == pytest.approx(model.normal, abs=1e-7)

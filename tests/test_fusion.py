@@ -11,8 +11,16 @@ import pytest
 
 from thermofusion.depth.filter import DepthFrames
 from thermofusion.errors import ResourceError, ScanError
-from thermofusion.geometry import mesh as meshing
 from thermofusion.geometry.camera import pixel_rays
+from thermofusion.geometry.mesh import (
+    canonical,
+    close_pinholes,
+    components,
+    keep_vertices,
+    smooth_positions,
+    triangle_normals,
+    vertex_areas,
+)
 from thermofusion.geometry.normals import window_normals
 from thermofusion.recipe import load_recipe
 from thermofusion.surface import surface as fusion
@@ -144,7 +152,7 @@ def test_a_ball_comes_out_round_closed_and_facing_outward(ball) -> None:
     assert angle.mean() < 1.5
     assert np.percentile(angle, 99) < 4.0
     np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-5)
-    face = meshing.triangle_normals(mesh.vertices_m, mesh.triangles)
+    face = triangle_normals(mesh.vertices_m, mesh.triangles)
     assert ((face * outward[mesh.triangles[:, 0]]).sum(1) > 0).mean() > 0.999  # counter-clockwise from outside
 
 
@@ -168,9 +176,9 @@ def test_no_memory_to_begin_with_costs_no_surface(ball) -> None:
     sections = {"input": recipe.input, "surface": recipe.fusion}
     plan = plan_grid(scan, survey, **sections)
     grid, _ = integrate_frames(survey, frames, placed, replace(plan, blocks=1), **sections)
-    V, F = meshing.canonical(*grid.extract(3))
+    V, F = canonical(*grid.extract(3))
     assert grid.blocks == expected.blocks_used
-    F = meshing.close_pinholes(V, F, fusion.PINHOLE_VOXELS * plan.voxel_m)
+    F = close_pinholes(V, F, fusion.PINHOLE_VOXELS * plan.voxel_m)
     np.testing.assert_array_equal(V, expected.mesh.vertices_m)
     np.testing.assert_array_equal(F, expected.mesh.triangles)
     assert expected.blocks_used <= expected.blocks_estimated < 2 * expected.blocks_used
@@ -343,14 +351,12 @@ def test_pinholes_close_and_openings_stay(ball) -> None:
     lost = rng.choice(len(mesh.triangles), 150, replace=False)
     torn = np.delete(mesh.triangles, lost, axis=0)
     assert not closed(replace(mesh, triangles=torn))
-    mended = meshing.close_pinholes(mesh.vertices_m, torn, 0.05)
+    mended = close_pinholes(mesh.vertices_m, torn, 0.05)
     assert closed(replace(mesh, triangles=mended))
     np.testing.assert_allclose(
-        meshing.vertex_areas(mesh.vertices_m, mended).sum(), meshing.vertex_areas(mesh.vertices_m, mesh.triangles).sum()
+        vertex_areas(mesh.vertices_m, mended).sum(), vertex_areas(mesh.vertices_m, mesh.triangles).sum()
     )
-    np.testing.assert_array_equal(
-        meshing.close_pinholes(mesh.vertices_m, mesh.triangles[far], 0.05), mesh.triangles[far]
-    )
+    np.testing.assert_array_equal(close_pinholes(mesh.vertices_m, mesh.triangles[far], 0.05), mesh.triangles[far])
 
 
 def test_canonical_order_depends_on_the_shape_alone(ball) -> None:
@@ -360,7 +366,7 @@ def test_canonical_order_depends_on_the_shape_alone(ball) -> None:
     back = np.empty_like(shuffle)
     back[shuffle] = np.arange(len(shuffle))
     tri = np.roll(back[mesh.triangles], 1, axis=1)[rng.permutation(len(mesh.triangles))]
-    V, F = meshing.canonical(mesh.vertices_m[shuffle], tri)
+    V, F = canonical(mesh.vertices_m[shuffle], tri)
     np.testing.assert_array_equal(V, mesh.vertices_m)
     np.testing.assert_array_equal(F, mesh.triangles)
 
@@ -369,13 +375,13 @@ def test_pieces_areas_and_smoothing(ball) -> None:
     mesh = ball[2].mesh
     V = np.concatenate([mesh.vertices_m, mesh.vertices_m + np.float32([1, 0, 0])]).astype(np.float32)
     F = np.concatenate([mesh.triangles, mesh.triangles + len(mesh)])
-    label = meshing.components(F, len(V))
+    label = components(F, len(V))
     assert len(np.unique(label)) == 2
-    kept, tri = meshing.keep_vertices(V, F, label == label[0])
+    kept, tri = keep_vertices(V, F, label == label[0])
     np.testing.assert_array_equal(kept, mesh.vertices_m)
     np.testing.assert_array_equal(tri, mesh.triangles)
-    assert meshing.vertex_areas(V, F).sum() == pytest.approx(2 * 4 * np.pi * 0.15**2, rel=0.03)
-    smooth = meshing.smooth_positions(kept, tri, 10)
+    assert vertex_areas(V, F).sum() == pytest.approx(2 * 4 * np.pi * 0.15**2, rel=0.03)
+    smooth = smooth_positions(kept, tri, 10)
     error = [np.abs(np.linalg.norm(x, axis=1) - 0.15) for x in (kept, smooth)]
     assert error[1].mean() < 0.9 * error[0].mean()
     assert np.linalg.norm(smooth, axis=1).mean() == pytest.approx(0.15, abs=0.2e-3)  # Taubin does not shrink

@@ -9,8 +9,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.linalg import expm
+from support.scan_maker import backproject
 
-from thermofusion.geometry import rigid as g
+from thermofusion.geometry.camera import pixel_rays, project, viewing_cosine
+from thermofusion.geometry.rigid import (
+    interpolate_trajectory,
+    invert,
+    rigid_alignment,
+    se3_exp,
+    se3_log,
+    transform_points,
+)
 from thermofusion.types import Camera, Trajectory, check_rigid
 
 twists = arrays(np.float64, 6, elements=st.floats(-1.5, 1.5, allow_subnormal=False))
@@ -25,29 +34,29 @@ def test_exponential_is_the_matrix_exponential_and_inverts(xi):
     A = np.zeros((4, 4))
     A[:3, :3] = [[0, -xi[2], xi[1]], [xi[2], 0, -xi[0]], [-xi[1], xi[0], 0]]
     A[:3, 3] = xi[3:]
-    T = g.se3_exp(xi)
+    T = se3_exp(xi)
     np.testing.assert_allclose(T, expm(A), atol=1e-9)
-    np.testing.assert_allclose(g.se3_log(T), xi, atol=1e-7)
-    np.testing.assert_allclose(g.invert(T) @ T, np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(se3_log(T), xi, atol=1e-7)
+    np.testing.assert_allclose(invert(T) @ T, np.eye(4), atol=1e-12)
 
 
 @given(twists, twists)
 @settings(max_examples=30, deadline=None)
 def test_interpolation_is_independent_of_the_world_frame(a, b):
-    T = np.stack([np.eye(4), g.se3_exp(0.3 * a)])
-    W = g.se3_exp(b)
+    T = np.stack([np.eye(4), se3_exp(0.3 * a)])
+    W = se3_exp(b)
     times = np.array([0.2, 0.5, 0.9])
-    here, ok = g.interpolate_trajectory(Trajectory(np.array([0.0, 1.0]), T), times)
-    there, _ = g.interpolate_trajectory(Trajectory(np.array([0.0, 1.0]), W @ T), times)
+    here, ok = interpolate_trajectory(Trajectory(np.array([0.0, 1.0]), T), times)
+    there, _ = interpolate_trajectory(Trajectory(np.array([0.0, 1.0]), W @ T), times)
     assert ok.all()
     np.testing.assert_allclose(W @ here, there, atol=1e-9)
     # constant velocity along the geodesic
-    np.testing.assert_allclose(g.se3_log(here), 0.3 * a * times[:, None], atol=1e-7)
+    np.testing.assert_allclose(se3_log(here), 0.3 * a * times[:, None], atol=1e-7)
 
 
 def test_interpolation_refuses_gaps_and_far_ends():
     trajectory = Trajectory(np.array([0.0, 0.1, 0.2, 2.0]), np.tile(np.eye(4), (4, 1, 1)))
-    _, ok = g.interpolate_trajectory(trajectory, np.array([-1.0, -0.04, 0.05, 1.0, 0.2, 3.0]), max_gap_s=0.5)
+    _, ok = interpolate_trajectory(trajectory, np.array([-1.0, -0.04, 0.05, 1.0, 0.2, 3.0]), max_gap_s=0.5)
     assert ok.tolist() == [False, True, True, False, True, False]
 
 
@@ -55,7 +64,7 @@ def test_interpolation_refuses_gaps_and_far_ends():
 def test_projection_agrees_with_opencv(distortion):
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-0.4, 0.4, 500), rng.uniform(-0.3, 0.3, 500), rng.uniform(0.8, 1.5, 500)])
-    uv, z = g.project(Camera(640, 480, K, distortion), points)
+    uv, z = project(Camera(640, 480, K, distortion), points)
     expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, distortion)
     np.testing.assert_allclose(uv, expected[:, 0], atol=1e-8)
     np.testing.assert_array_equal(z, points[:, 2])
@@ -64,9 +73,9 @@ def test_projection_agrees_with_opencv(distortion):
 @pytest.mark.parametrize("distortion", [np.zeros(5), BARREL, RATIONAL], ids=["none", "barrel", "rational"])
 def test_pixel_rays_project_back_to_their_pixels(distortion):
     camera = Camera(640, 480, K, distortion)
-    rays = g.pixel_rays(camera)
+    rays = pixel_rays(camera)
     np.testing.assert_allclose(np.linalg.norm(rays, axis=-1), 1, atol=1e-12)
-    uv, _ = g.project(camera, rays.reshape(-1, 3))
+    uv, _ = project(camera, rays.reshape(-1, 3))
     u, v = np.meshgrid(np.arange(640), np.arange(480))
     np.testing.assert_allclose(uv.reshape(480, 640, 2), np.stack([u, v], -1), atol=1e-3)
 
@@ -74,7 +83,7 @@ def test_pixel_rays_project_back_to_their_pixels(distortion):
 def test_points_far_outside_the_field_do_not_fold_back_into_the_image():
     camera = Camera(640, 480, K, np.array([-0.4, 0.0, 0.0, 0.0, 0.0]))
     x = np.linspace(0, 3, 400)
-    uv, _ = g.project(camera, np.column_stack([x, np.zeros(400), np.ones(400)]))
+    uv, _ = project(camera, np.column_stack([x, np.zeros(400), np.ones(400)]))
     seen = np.isfinite(uv[:, 0])
     assert seen[0]
     assert not seen[-1]
@@ -82,7 +91,7 @@ def test_points_far_outside_the_field_do_not_fold_back_into_the_image():
 
 
 def test_points_behind_the_camera_are_not_seen():
-    uv, _ = g.project(Camera(640, 480, K), np.array([[0.1, 0.1, -1.0], [0.1, 0.1, 0.0], [0.1, 0.1, 1.0]]))
+    uv, _ = project(Camera(640, 480, K), np.array([[0.1, 0.1, -1.0], [0.1, 0.1, 0.0], [0.1, 0.1, 1.0]]))
     assert np.isnan(uv[:2]).all()
     assert np.isfinite(uv[2]).all()
 
@@ -91,9 +100,9 @@ def test_backprojection_inverts_projection():
     camera = Camera(64, 48, np.array([[60.0, 0, 31], [0, 61, 23], [0, 0, 1]]), BARREL)
     depth = np.random.default_rng(1).uniform(0.5, 2, (48, 64))
     depth[3, 4] = np.nan
-    points = g.backproject(camera, depth)
+    points = backproject(camera, depth)
     assert np.isnan(points[3, 4]).all()
-    uv, z = g.project(camera, np.delete(points.reshape(-1, 3), 3 * 64 + 4, 0))
+    uv, z = project(camera, np.delete(points.reshape(-1, 3), 3 * 64 + 4, 0))
     np.testing.assert_allclose(z, np.delete(depth.ravel(), 3 * 64 + 4), atol=1e-12)
     assert np.isfinite(uv).all()
 
@@ -102,15 +111,15 @@ def test_backprojection_inverts_projection():
 @settings(max_examples=30, deadline=None)
 def test_alignment_recovers_a_motion(xi):
     points = np.random.default_rng(2).normal(size=(30, 3))
-    T = g.se3_exp(xi)
-    np.testing.assert_allclose(g.rigid_alignment(points, g.transform_points(T, points)), T, atol=1e-9)
+    T = se3_exp(xi)
+    np.testing.assert_allclose(rigid_alignment(points, transform_points(T, points)), T, atol=1e-9)
 
 
 def test_viewing_angle_is_to_the_eye_not_to_the_axis():
     # a patch 30° off the axis that faces the eye squarely
     p = np.array([[np.sin(np.radians(30)), 0, np.cos(np.radians(30))]])
-    assert g.viewing_cosine(p, -p, np.zeros(3))[0] == pytest.approx(1.0)
-    assert g.viewing_cosine(p, p, np.zeros(3))[0] == pytest.approx(-1.0)
+    assert viewing_cosine(p, -p, np.zeros(3))[0] == pytest.approx(1.0)
+    assert viewing_cosine(p, p, np.zeros(3))[0] == pytest.approx(-1.0)
 
 
 @pytest.mark.parametrize(

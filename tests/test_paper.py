@@ -19,7 +19,7 @@ from thermofusion.paper.cylinder import BAND, ROOM_DEGC, ROWS, SHAPE, Profile, U
 from thermofusion.paper.report import Figure, Number, PaperReport
 from thermofusion.paper.sideview import ByAngle, Compared
 from thermofusion.physics.emissivity import Fresnel
-from thermofusion.report.plot import Axis, Band, Line, Picture, Plot, Points, Polar, csv_text, page
+from thermofusion.report.plot import Area, Axis, Line, Picture, Plot, Points, Polar, csv_text, page
 from thermofusion.types import Observations
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -36,7 +36,7 @@ def test_page_is_well_formed_and_the_same_every_time():
     x = np.linspace(0, 90, 5)
     panels = [
         Plot(
-            "<a> & b", Axis("x", 0, 90, 15), Axis("y", -1, 1, 0.5), [Line(x, np.sin(x), label="s"), Band(x, x * 0, x)]
+            "<a> & b", Axis("x", 0, 90, 15), Axis("y", -1, 1, 0.5), [Line(x, np.sin(x), label="s"), Area(x, x * 0, x)]
         ),
         Polar("p", Axis("r", 0, 1, 0.25), [Line(x, np.cos(np.radians(x)))]),
         Picture("i", np.zeros((4, 6, 3), np.uint8), None, [Points([1, 2], [1, 2])]),

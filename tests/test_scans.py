@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from conftest import ROOT
 from support import scan_maker as make
+from support.scan_maker import backproject, write_pnm
 
 from thermofusion.errors import RecipeError, ScanError
-from thermofusion.files.pnm import read_pnm, write_pnm
-from thermofusion.geometry.camera import backproject, project
+from thermofusion.files.pnm import read_pnm
+from thermofusion.geometry.camera import project
 from thermofusion.geometry.rigid import pose, se3_exp, transform_points
 from thermofusion.mapping.views import NO_POSE, OUTSIDE, SHUTTER, thermal_views
 from thermofusion.physics.signal import counts_to_kelvin
@@ -327,8 +328,8 @@ DEVICE_COLOR = (
 
 def test_azure_calibration_equals_the_vendors_numbers():
     tree = json.loads(make.calibration_json(DEVICE_DEPTH, DEVICE_COLOR))
-    depth, _ = azure.camera_of(tree, "depth", 640, 576, "x")
-    color, T = azure.camera_of(tree, "color", 1920, 1080, "x")
+    depth, _ = azure.azure_camera(tree, "depth", 640, 576, "x")
+    color, T = azure.azure_camera(tree, "color", 1920, 1080, "x")
     K = depth.K
     np.testing.assert_allclose(
         [K[0, 2], K[1, 2], K[0, 0], K[1, 1]], [332.064270, 325.880615, 503.927643, 503.978729], atol=2e-5

@@ -17,7 +17,7 @@ from thermofusion.tracking import track as tracking
 from thermofusion.tracking.frames import coarse_depth, local_contrast, stiffness_of
 from thermofusion.tracking.joint import solve_jointly
 from thermofusion.tracking.maps import DepthMap
-from thermofusion.tracking.registration import agreement, register
+from thermofusion.tracking.registration import agreement, register_view
 from thermofusion.types import Rig, Stream, Trajectory
 
 RECIPE = load_recipe("torso")
@@ -190,7 +190,7 @@ def test_register_finds_a_motion_back(walk, seed):
     a, b = maps_of(walk, 10, 12)
     truth = invert(walk.T_body_depth[10]) @ walk.T_body_depth[12]
     off = se3_exp(np.random.default_rng(seed).normal(0, [0.02] * 3 + [0.015] * 3))
-    T, partners = register(b, [(a, np.eye(4))], off @ truth, (0.08, 0.06, 0.05, 0.04, 0.03, 0.03, 0.03, 0.03))
+    T, partners = register_view(b, [(a, np.eye(4))], off @ truth, (0.08, 0.06, 0.05, 0.04, 0.03, 0.03, 0.03, 0.03))
     error = invert(truth) @ T
     assert partners is not None
     assert np.linalg.norm(error[:3, 3]) < 5e-3

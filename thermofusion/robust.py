@@ -27,7 +27,7 @@ class Statistics:
 
     @classmethod
     def of(cls, error_K: NDArray, sigma_K: NDArray | None = None, weight: NDArray | None = None) -> Statistics:
-        """Of errors (N,), counted with weights (N,)."""
+        """Of errors error_K (N,) K with their sigma_K (N,), counted by weight (N,)."""
         if not len(error_K):
             return cls(0, *[float("nan")] * 5)
         e, w = np.asarray(error_K, np.float64), np.ones(len(error_K)) if weight is None else weight
@@ -38,7 +38,7 @@ class Statistics:
 
 
 def weighted_quantile(values: NDArray, weights: NDArray, q: float) -> float:
-    """The value below which the share q of the weight lies."""
+    """The value below which the share q of the weight lies: values (N,) of any unit, weights (N,)."""
     order = np.argsort(values, kind="stable")
     total = np.cumsum(np.asarray(weights, np.float64)[order])
     return float(values[order[np.searchsorted(total, q * total[-1])]])

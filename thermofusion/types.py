@@ -25,7 +25,7 @@ RIGID_TOLERANCE = 1e-4  # deviation of RᵀR from identity: hand-typed extrinsic
 
 
 def check_rigid(T: object, name: str) -> Float:
-    """A 4x4 rigid transform as float64, rotation re-orthonormalised. Raises ValueError naming `name`."""
+    """A rigid transform (4, 4) [m] as float64, rotation re-orthonormalised. Raises ValueError naming `name`."""
     M = np.asarray(T, dtype=np.float64)
     if M.shape != (4, 4):
         raise ValueError(f"{name} must be a 4x4 matrix, got shape {M.shape}")
@@ -304,7 +304,7 @@ class Observations:
         return len(self.vertex)
 
     def select(self, mask: NDArray) -> Observations:
-        """The rows of a boolean mask or index array."""
+        """The rows of a boolean mask (N,) or an index array (M,)."""
         return Observations(**{k: getattr(self, k)[mask] for k in self.__dataclass_fields__})
 
 
@@ -403,7 +403,7 @@ class ThermalMesh:
         anchored: bool = True,
         metadata: dict[str, str | float] | None = None,
     ) -> ThermalMesh:
-        """A mesh of which only the temperature is known (a truth, a foreign file): everything else NaN or 0."""
+        """A mesh of which only temperature_degC (V,) is known (a truth, a foreign file): everything else NaN or 0."""
         nan = np.full(len(surface), np.nan, np.float32)
         count, flags = np.zeros(len(surface), np.int32), np.zeros(len(surface), np.uint8)
         known = dict(metadata or {})

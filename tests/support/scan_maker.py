@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from thermofusion.geometry.camera import pixel_rays
 from thermofusion.geometry.rigid import pose
 from thermofusion.scans.common import as_thermal
 from thermofusion.types import (
@@ -212,3 +213,18 @@ def flir_jpeg(container, parts=2):
         body = b"FLIR\0\x01" + bytes([i, parts - 1]) + container[i * step : (i + 1) * step]
         segments += b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body
     return picture[:2] + segments + picture[2:]
+
+
+def write_pnm(image, byteorder=">"):
+    """PGM of (H, W) or PPM of (H, W, 3 as B, G, R), uint8 or uint16."""
+    h, w = image.shape[:2]
+    pixels = image if image.ndim == 2 else image[..., ::-1]
+    maxval = 255 if image.dtype == np.uint8 else 65535
+    kind = 5 if image.ndim == 2 else 6
+    return f"P{kind} {w} {h} {maxval}\n".encode() + pixels.astype(image.dtype.newbyteorder(byteorder)).tobytes()
+
+
+def backproject(camera, depth_m):
+    """Depth image (H, W) in metres along z, NaN = none, to points (H, W, 3) in the camera's frame."""
+    rays = pixel_rays(camera)
+    return rays * (depth_m / rays[..., 2])[..., None]

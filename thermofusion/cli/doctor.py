@@ -28,7 +28,7 @@ MIN_MEMORY_GIB = 4.0
 
 
 @dataclass(frozen=True)
-class Finding:
+class Examined:
     """One line of the examination."""
 
     subject: str
@@ -36,53 +36,53 @@ class Finding:
     text: str
 
 
-def examine() -> list[Finding]:
+def examine() -> list[Examined]:
     """All findings, cheapest first. Never raises: what cannot be examined is itself a finding."""
     return [_python(), _libc(), *_packages(), _open3d(), _memory(), *_usb()]
 
 
-def _python() -> Finding:
+def _python() -> Examined:
     ok = sys.version_info >= (3, 11)
-    return Finding("python", "ok" if ok else "problem", f"{platform.python_version()} on {platform.platform()}")
+    return Examined("python", "ok" if ok else "problem", f"{platform.python_version()} on {platform.platform()}")
 
 
-def _libc() -> Finding:
+def _libc() -> Examined:
     name, version = platform.libc_ver()
-    return Finding(
+    return Examined(
         "libc", "ok" if name else "warning", f"{name} {version}" if name else "not glibc: wheels may not fit"
     )
 
 
-def _packages() -> list[Finding]:
+def _packages() -> list[Examined]:
     found = []
     for name in PACKAGES:
         try:
-            found.append(Finding(name, "ok", importlib.metadata.version(name)))
+            found.append(Examined(name, "ok", importlib.metadata.version(name)))
         except importlib.metadata.PackageNotFoundError:
-            found.append(Finding(name, "problem", f"not installed; run `pip install {name}`"))
+            found.append(Examined(name, "problem", f"not installed; run `pip install {name}`"))
     return found
 
 
-def _open3d() -> Finding:
+def _open3d() -> Examined:
     try:
         from ..geometry._open3d import o3d
     except Exception as e:  # a wheel that does not load raises OSError, ImportError and others
-        return Finding("open3d loads", "problem", f"{type(e).__name__}: {e}")
-    return Finding(
+        return Examined("open3d loads", "problem", f"{type(e).__name__}: {e}")
+    return Examined(
         "open3d loads", "ok", f"CPU; CUDA {'available' if o3d.core.cuda.is_available() else 'not available'}"
     )
 
 
-def _memory() -> Finding:
+def _memory() -> Examined:
     try:
         gib = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     except (ValueError, OSError):
-        return Finding("memory", "warning", "unknown")
+        return Examined("memory", "warning", "unknown")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return Finding("memory", "ok" if gib >= MIN_MEMORY_GIB else "warning", f"{gib:.1f} GiB, {cores} cores")
+    return Examined("memory", "ok" if gib >= MIN_MEMORY_GIB else "warning", f"{gib:.1f} GiB, {cores} cores")
 
 
-def _usb() -> list[Finding]:
+def _usb() -> list[Examined]:
     try:
         import libusb_package
         import usb.core
@@ -90,7 +90,7 @@ def _usb() -> list[Finding]:
         devices = list(usb.core.find(find_all=True, backend=libusb_package.get_libusb1_backend()) or [])
     except Exception as e:
         return [
-            Finding("usb", "warning", f"the bus cannot be listed ({type(e).__name__}: {e}); recording will not work")
+            Examined("usb", "warning", f"the bus cannot be listed ({type(e).__name__}: {e}); recording will not work")
         ]
     found = []
     for device in devices:
@@ -100,5 +100,5 @@ def _usb() -> list[Finding]:
         node = Path(f"/dev/bus/usb/{device.bus:03d}/{device.address:03d}")
         allowed = not node.exists() or os.access(node, os.R_OK | os.W_OK)
         hint = "" if allowed else f"; no permission on {node}: add a udev rule for it"
-        found.append(Finding("usb", "ok" if allowed else "problem", f"{name} at {device.bus}:{device.address}{hint}"))
-    return found or [Finding("usb", "ok", f"{len(devices)} devices on the bus, no camera known to thermofusion")]
+        found.append(Examined("usb", "ok" if allowed else "problem", f"{name} at {device.bus}:{device.address}{hint}"))
+    return found or [Examined("usb", "ok", f"{len(devices)} devices on the bus, no camera known to thermofusion")]

@@ -22,7 +22,7 @@ from ..types import Bool, Camera, Float32, Scan
 MIN_NEIGHBOURS = 3  # of 8: what the corner of a surface still has, and a one-pixel veil between two surfaces has not
 CELL_PX = 4  # slopes are taken between means over squares of this size: single pixels carry only noise
 MIN_CELL_SHARE = 0.25  # of a cell's pixels that must hold depth
-READERS = 2  # threads that decode frames ahead: what keeps up with one that processes them
+READERS = 2  # threads that decode frames ahead
 
 
 def filter_depth(depth_m: Float32, camera: Camera, section: InputSection) -> Float32:

@@ -24,7 +24,7 @@ JUMP_AT_1M = 0.05  # depth step between neighbours (times range) that separates 
 BEHIND_M = 0.30  # at 1 m and beyond: clear air between subject and background
 BEHIND_SHARE = 0.9  # of a piece's pixels: the rest may be flying ones
 PIECES_PX = 160  # pieces are looked for on about this many pixels of a row
-STATIC_FRAMES = 24
+STATIC_FRAMES = 24  # spread through the recording: enough for a quantile of each pixel's depths
 STATIC_SPREAD_AT_1M = 0.01  # a pixel whose depth stays within this (times range²) shows something that does not move
 STATIC_QUANTILE = 0.85  # of a pixel's depths: its far end, without the farthest outliers
 ALWAYS_SHARE, ALWAYS_AREA = 0.8, 0.2  # a piece of room: a fifth of its pixels show it in four of five frames
@@ -66,7 +66,7 @@ class SubjectFrames:
 
 
 def find_floor(depth_m: Float32, rays: Float32) -> Float | None:
-    """The floor (4,) `[n, d]` in a depth image (H, W) m, or None: n·p + d is the height in m of a point of the camera's
+    """The floor (4,) `[n, d]` in depth_m (H, W), or None: n·p + d is the height in m of a point of the camera's
     frame above it. rays : (H, W, 3) directions with z = 1. Looked for on a grid of pixels (see `floor_in_view`).
     """
     step = max(1, round(depth_m.shape[1] / GRID))
@@ -148,5 +148,5 @@ def static_scene(frames: DepthFrames) -> Float32:
 
 
 def static_tolerance(depth_m: Float32) -> Float32:
-    """Within this of the standing room a pixel shows the room, metres."""
+    """(H, W) m: within this of the standing room, `depth_m` (H, W) m, a pixel shows the room."""
     return np.float32(STATIC_SPREAD_AT_1M) * np.maximum(depth_m, np.float32(0.5)) ** 2

@@ -24,8 +24,9 @@ def view_axes(
     floor_normal: ArrayLike | None = None,
     depth_up: ArrayLike = CAMERA_UP,
 ) -> dict[str, str]:
-    """The metadata entries `up` and `front` from the trajectory (N, 4, 4) and the subject's centre (3,).
+    """The metadata entries `up` and `front` from T_world_depth (N, 4, 4) and the subject's centre_m (3,).
 
+    floor_normal : (3,) unit, in the world; None = no floor found.
     depth_up : which way was up for the camera as it was held: (0, -1, 0), or (-1, 0, 0) turned by a quarter.
     up : the floor's normal where one was found. Else hand-held cameras are pitched at will but hardly rolled, so their
     right axes are level: up is what is perpendicular to all of them (smallest eigenvector of Σ r rᵀ), if they turn
@@ -54,7 +55,10 @@ def axes_of(metadata: Mapping[str, str | float]) -> Float:
 
 
 def axes_rotation(up: ArrayLike, front: ArrayLike) -> Float:
-    """Rotation with rows (right, up, front); `up` is kept, `front` made perpendicular to it."""
+    """Rotation (3, 3) with rows (right, up, front), unit vectors, from directions up and front (3,) of any length.
+
+    `up` is kept, `front` made perpendicular to it.
+    """
     u = np.asarray(up, np.float64)
     u = u / np.linalg.norm(u)
     candidates = (np.asarray(front, np.float64), np.array(CAMERA_FRONT), *np.eye(3))

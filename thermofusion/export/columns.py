@@ -69,7 +69,10 @@ def result_from(
     description: Mapping[str, Any],
     place: object,
 ) -> ThermalMesh:
-    """A ThermalMesh from what a reader found; absent columns become NaN, or 0 for counts and flags."""
+    """A ThermalMesh from what a reader found; absent columns become NaN, or 0 for counts and flags.
+
+    columns : field -> (V,) in its unit. parts : part of the budget -> (V,) K. Raises ScanError naming the place.
+    """
     mode = description.get("output_mode", "absolute")
     metadata = description.get("metadata", {})
     if mode not in get_args(OutputMode) or description.get("level", "anchored") not in ("anchored", "relative"):
@@ -102,7 +105,10 @@ def result_from(
 def surface_from(
     vertices_m: NDArray, triangles: NDArray, normals: NDArray | None, color_rgb: NDArray | None, place: object
 ) -> SurfaceMesh:
-    """A checked SurfaceMesh from a file's arrays; absent normals are computed."""
+    """A checked SurfaceMesh from a file's arrays; absent normals are computed.
+
+    vertices_m : (V, 3). triangles : (F, 3). normals : (V, 3) unit. color_rgb : (V, 3) sRGB. Raises ScanError.
+    """
     if not np.isfinite(vertices_m).all():
         raise ScanError("a vertex position is not a finite number", place=place)
     if len(triangles) and not (0 <= int(triangles.min()) <= int(triangles.max()) < len(vertices_m)):
@@ -129,7 +135,7 @@ def check_mesh(mesh: ThermalMesh) -> None:
 
 
 def vertex_normals(vertices_m: Float32, triangles: Int) -> Float32:
-    """Area-weighted unit normals (V, 3); (0, 0, 1) where a vertex has no triangle."""
+    """Area-weighted unit normals (V, 3) of vertices_m (V, 3) m and triangles (F, 3); (0, 0, 1) where there is none."""
     a, b, c = (vertices_m[triangles[:, i]].astype(np.float64) for i in range(3))
     face = np.cross(b - a, c - a)
     sums = [np.bincount(triangles.ravel(), np.repeat(face[:, k], 3), len(vertices_m)) for k in range(3)]
@@ -137,7 +143,7 @@ def vertex_normals(vertices_m: Float32, triangles: Int) -> Float32:
 
 
 def unit_normals(normals: NDArray) -> Float32:
-    """Normals of length 1 (glTF demands it); a zero or NaN normal becomes (0, 0, 1)."""
+    """Normals (N, 3) of unit length (glTF demands it); a zero or NaN normal becomes (0, 0, 1)."""
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     ok = np.isfinite(length) & (length > 1e-12)
     with np.errstate(divide="ignore", invalid="ignore"):

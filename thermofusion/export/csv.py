@@ -36,7 +36,7 @@ def write_csv(path: str | Path, mesh: ThermalMesh) -> Path:
 
 
 def read_csv(path: str | Path) -> dict[str, NDArray]:
-    """The columns by name, float64 (NaN = empty cell) or text. Raises ScanError."""
+    """The columns (V,) by name, float64 in the unit of the name (NaN = empty cell) or text. Raises ScanError."""
     try:
         lines = read_whole(path).decode("utf-8").splitlines()
     except UnicodeDecodeError:

@@ -26,8 +26,8 @@ from .axes import axes_of
 from .columns import COLUMNS, check_mesh, describe, result_from, surface_from, unit_normals
 from .palettes import apply, color_range, srgb_to_linear, unmeasured_rgb
 
-FLOAT, UINT16, UINT32 = 5126, 5123, 5125
-ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
+FLOAT, UINT16, UINT32 = 5126, 5123, 5125  # glTF's componentType
+ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963  # glTF's bufferView.target
 SKIN, UNMEASURED = "skin", "unmeasured"
 _SHAPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _DTYPES = {FLOAT: "<f4", UINT16: "<u2", UINT32: "<u4"}

@@ -32,7 +32,7 @@ _POLYLINES = {
 }
 PALETTES: tuple[str, ...] = get_args(PaletteName)  # what a recipe may name
 WARNINGS = {"rainbow": "the rainbow palette shows edges that are not in the data; use it only to match older pictures"}
-UNMEASURED_RGB = (168, 168, 168)
+UNMEASURED_RGB = (168, 168, 168)  # sRGB: a grey that no coloured palette holds
 UNMEASURED_ON_GREY_RGB = (96, 128, 176)  # the grey and cividis palettes pass through grey: unmeasured skin is bluish
 DEFAULT_RANGE_DEGC = (20.0, 40.0)  # where nothing is measured
 
@@ -65,7 +65,7 @@ def apply(values: ArrayLike, palette: str, lo: float, hi: float, nan_rgb: tuple[
 
 
 def palette_index(values: NDArray, lo: float, hi: float) -> UInt8:
-    """The table's row for each value; NaN gives 0. Raises RecipeError unless lo < hi."""
+    """The table's row, an index, for values of any shape; NaN gives 0. Raises RecipeError unless lo < hi."""
     if not (np.isfinite(lo) and np.isfinite(hi) and lo < hi):
         raise RecipeError(f"a colour range needs low < high, got {lo} to {hi}")
     scaled = (np.nan_to_num(values, nan=lo) - np.float32(lo)) * np.float32(255 / (hi - lo))
@@ -75,9 +75,9 @@ def palette_index(values: NDArray, lo: float, hi: float) -> UInt8:
 def color_range(
     values: NDArray, given: tuple[float, float] | None = None, *, step: float = 0.5, symmetric: bool = False
 ) -> tuple[float, float]:
-    """The range to show: `given`, else 1st to 99th percentile, rounded outward to `step`.
+    """The range to show: `given`, else 1st to 99th percentile of values (any shape), rounded outward to `step`.
 
-    symmetric : about 0, for differences. With nothing measured: `DEFAULT_RANGE_DEGC`.
+    In the unit of values. symmetric : about 0, for differences. With nothing measured: `DEFAULT_RANGE_DEGC`.
     """
     if given is not None:
         palette_index(np.zeros(0, np.float32), *given)  # the same complaint about low >= high
@@ -93,13 +93,7 @@ def color_range(
 
 
 def srgb_to_linear(srgb: UInt8) -> NDArray[np.float32]:
-    """sRGB bytes to linear light, 0..1 (IEC 61966-2-1)."""
+    """sRGB bytes of any shape to linear light, 0..1 (IEC 61966-2-1)."""
     c = np.arange(256) / 255
     linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4).astype(np.float32)
     return linear[srgb]
-
-
-def lightness(srgb: UInt8) -> NDArray[np.float32]:
-    """CIE L* (0..100) of sRGB bytes (..., 3), D65 white."""
-    y = srgb_to_linear(srgb) @ np.array([0.2126, 0.7152, 0.0722], np.float32)
-    return np.where(y > (6 / 29) ** 3, 116 * np.cbrt(y) - 16, y * (29 / 3) ** 3)

@@ -25,7 +25,7 @@ from .palettes import apply, color_range
 XYZ, NORMAL, RGB = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
 QUALITY = "quality"  # = scalar_temperature, for MeshLab
 FACE = np.dtype([("n", "u1"), ("v", "<i4", 3)])
-COMMENT_CHARACTERS = 200
+COMMENT_CHARACTERS = 200  # of a value in one header line: MeshLab refuses lines of about 500
 _NUMBERS = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
 _NUMBERS |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
 _NUMBERS |= {"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}

@@ -34,12 +34,3 @@ def read_pnm(data: bytes, *, place: object, byteorder: Literal[">", "<"] = ">", 
     pixels = np.frombuffer(data, dtype, w * h * channels, header.end()).reshape(shape)
     pixels = pixels.astype(dtype.newbyteorder("="))
     return pixels if channels == 1 else np.ascontiguousarray(pixels[..., ::-1])
-
-
-def write_pnm(image: NDArray, byteorder: Literal[">", "<"] = ">") -> bytes:
-    """PGM of (H, W) or PPM of (H, W, 3 as B, G, R), uint8 or uint16."""
-    h, w = image.shape[:2]
-    pixels = image if image.ndim == 2 else image[..., ::-1]
-    maxval = 255 if image.dtype == np.uint8 else 65535
-    kind = 5 if image.ndim == 2 else 6
-    return f"P{kind} {w} {h} {maxval}\n".encode() + pixels.astype(image.dtype.newbyteorder(byteorder)).tobytes()

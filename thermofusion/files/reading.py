@@ -96,15 +96,16 @@ def read_numbers(path: Path, *, columns: int | None = None) -> Float:
 
 
 def read_image(path: Path, *, shape: tuple[int, int] | None = None, kind: str = "image") -> NDArray:
-    """Decode an image unchanged (depth of bits kept; colour as B, G, R). PNG, JPEG, TIFF, PGM, PPM.
+    """Decode an image unchanged, (H, W) or (H, W, 3): depth of bits kept, colour as B, G, R. PNG, JPEG, TIFF, PNM.
 
-    shape : expected (height, width). Raises ScanError naming the file: absent, empty, truncated, oversized, wrong size.
+    shape : expected (height, width), px. Raises ScanError naming the file: absent, empty, truncated, oversized, of
+    another size.
     """
     return decode_image(read_bytes(path, kind), shape=shape, kind=kind, place=path)
 
 
 def decode_image(data: bytes, *, shape: tuple[int, int] | None, kind: str, place: object) -> NDArray:
-    """`read_image` on bytes. The size the header claims is judged before anything is decoded."""
+    """`read_image` on bytes: (H, W) or (H, W, 3). The size in px that the header claims is judged before decoding."""
     size = claimed_size(data, place)
     if size is None:
         raise ScanError(
@@ -201,7 +202,7 @@ def _png_fault(data: bytes) -> str | None:
 def depth_from_raw(
     raw: NDArray, unit_m: float, *, place: object, invalid: tuple[int, ...] = (0,)
 ) -> NDArray[np.float32]:
-    """16-bit depth to float32 metres with NaN where there is none."""
+    """16-bit depth `raw` (H, W), numbers of `unit_m`, to float32 metres with NaN where there is none."""
     if raw.dtype != np.uint16 or raw.ndim != 2:
         raise ScanError(f"depth is {raw.dtype} with {raw.ndim} axes, expected 16-bit grey", place=place)
     depth = raw.astype(np.float32) * np.float32(unit_m)
@@ -219,7 +220,7 @@ def read_whole(path: str | Path) -> bytes:
 
 
 def read_array(data: bytes, dtype: np.dtype | str, count: int, offset: int, place: object) -> NDArray:
-    """`count` items at `offset`, copied and thus writable. Raises ScanError where the file ends before."""
+    """Numbers (N,), `count` of them, from byte `offset` on, writable. Raises ScanError if the file ends before."""
     dtype = np.dtype(dtype)
     if count < 0 or offset < 0 or offset + count * dtype.itemsize > len(data):
         raise ScanError("the file is truncated: it ends before its own header says", place=place)

@@ -56,7 +56,7 @@ def write_trajectory(path: str | Path, trajectory: Trajectory, *, exact: bool = 
 
 
 def poses_to_trajectory(times_s: NDArray, poses: NDArray, *, place: object) -> Trajectory:
-    """(N, 4, 4) T_world_depth in metres with their times; rotations are made exactly orthonormal.
+    """The poses (N, 4, 4) T_world_depth in metres with their times_s (N,); rotations are made exactly orthonormal.
 
     Raises ScanError for a pose that is no rigid transform to `POSE_TOLERANCE`.
     """

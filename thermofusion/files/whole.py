@@ -37,7 +37,10 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 
 def write_whole(path: str | Path, chunks: Iterable[bytes | NDArray]) -> Path:
-    """Write bytes and arrays (any shape, in C order) one after another; returns the path. Raises ResourceError."""
+    """Write chunks, bytes and arrays of any shape and dtype, one after another in C order; returns the path.
+
+    Arrays go as they lie in memory: in the unit and byte order the caller gave them. Raises ResourceError.
+    """
     with replacing(path) as temporary, temporary.open("wb") as f:
         for chunk in chunks:
             if isinstance(chunk, np.ndarray):

@@ -1,7 +1,6 @@
-"""Rigid motions and the pinhole camera: pure NumPy (and SciPy's rotations).
+"""The pinhole camera: distortion, projection, pixel rays, viewing angles. Pure NumPy.
 
-Frames: `T_a_b` (4x4) takes a point from frame b to frame a, p_a = T_a_b p_b. Camera: x right, y down, z forward; the
-centre of the first pixel is (0, 0) (paper Eqs. 2-8, with OpenCV's coefficient order).
+x right, y down, z forward; the centre of the first pixel is (0, 0) (paper Eqs. 2-8, with OpenCV's coefficient order).
 """
 
 from __future__ import annotations
@@ -11,11 +10,12 @@ from numpy.typing import NDArray
 
 from ..types import Camera, Float
 
-# ---------------------------------------------------------------- the camera
-
 
 def distort(x: NDArray, y: NDArray, distortion: Float) -> tuple[NDArray, NDArray]:
-    """Ideal image-plane coordinates (z = 1) to distorted ones; OpenCV's rational + tangential model (Eqs. 6-7)."""
+    """Ideal image-plane coordinates (z = 1) to distorted ones; OpenCV's rational + tangential model (Eqs. 6-7).
+
+    x, y : any shape, positions on the plane z = 1. distortion : (5,) or (8,), see `Camera`.
+    """
     k1, k2, p1, p2, k3 = distortion[:5]
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -27,7 +27,10 @@ def distort(x: NDArray, y: NDArray, distortion: Float) -> tuple[NDArray, NDArray
 
 
 def undistort(x_d: NDArray, y_d: NDArray, distortion: Float, *, iterations: int = 30) -> tuple[NDArray, NDArray]:
-    """Inverse of `distort` by fixed-point iteration with a Newton-like scale; NaN where it does not converge."""
+    """Inverse of `distort` by fixed-point iteration with a Newton-like scale; NaN where it does not converge.
+
+    x_d, y_d : any shape, positions on the plane z = 1. distortion : (5,) or (8,), see `Camera`.
+    """
     x, y = np.array(x_d, np.float64), np.array(y_d, np.float64)
     if not np.any(distortion):
         return x, y
@@ -41,9 +44,10 @@ def undistort(x_d: NDArray, y_d: NDArray, distortion: Float, *, iterations: int 
 
 
 def max_image_radius(distortion: Float) -> float:
-    """Largest ideal radius r up to which the radial model is increasing.
+    """Largest ideal radius r (z = 1, dimensionless) up to which the radial model is increasing; inf without distortion.
 
-    Beyond it a barrel-distorted model folds back: points far outside the field of view would land *inside* the image.
+    distortion : (5,) or (8,). Beyond r a barrel-distorted model folds back: points far outside the field of view would
+    land *inside* the image.
     """
     if not np.any(distortion):
         return np.inf
@@ -67,7 +71,10 @@ def project(camera: Camera, points: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def pixel_rays(camera: Camera, u_px: NDArray | None = None, v_px: NDArray | None = None) -> Float:
-    """Unit direction of each pixel's own ray in the camera's frame, (..., 3); the whole image (H, W, 3) by default."""
+    """Unit direction of each pixel's own ray in the camera's frame, (..., 3).
+
+    u_px, v_px : (...), image positions; without them the whole image, (H, W, 3).
+    """
     if u_px is None or v_px is None:
         u_px, v_px = np.meshgrid(
             np.arange(camera.width_px, dtype=np.float64), np.arange(camera.height_px, dtype=np.float64)
@@ -79,15 +86,10 @@ def pixel_rays(camera: Camera, u_px: NDArray | None = None, v_px: NDArray | None
     return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
 
-def backproject(camera: Camera, depth_m: NDArray) -> Float:
-    """Depth image (H, W) in metres along z, NaN = none, to points (H, W, 3) in the camera's frame."""
-    rays = pixel_rays(camera)
-    return rays * (depth_m / rays[..., 2])[..., None]
-
-
 def viewing_cosine(points: NDArray, normals: NDArray, eye: NDArray) -> NDArray:
     """Cosine of the viewing angle: between the unit normal and the ray from the surface to the eye, (N,).
 
+    points : (N, 3) m. normals : (N, 3) unit. eye : (3,) m.
     The pixel's own ray, not the camera axis of the paper's Eq. 28; negative for back faces.
     """
     d = eye.astype(points.dtype) - points

@@ -15,8 +15,8 @@ TAUBIN_SHRINK, TAUBIN_INFLATE = 0.5, -0.53  # low pass without shrinkage (Taubin
 def canonical(vertices: Float32, triangles: NDArray) -> tuple[Float32, Int]:
     """The same surface in an order that depends on its shape alone.
 
-    Marching cubes on a hash map deliver vertices in any order. Here vertices (V, 3) are sorted by z, y, x, and equal
-    ones merged; triangles lose degenerate ones, start at their lowest vertex, and are sorted.
+    Marching cubes on a hash map deliver vertices in any order. Here vertices (V, 3) m are sorted by z, y, x, and equal
+    ones merged; triangles (F, 3) lose degenerate ones, start at their lowest vertex, and are sorted.
     """
     vertices = vertices + np.float32(0)  # -0.0 becomes 0.0: equal numbers get equal bits
     order = np.lexsort(vertices.T)
@@ -38,13 +38,16 @@ def _in_order(triangles: Int) -> Int:
 
 
 def triangle_normals(vertices: Float32, triangles: Int) -> Float32:
-    """(F, 3) cross product of each triangle: outward, its length twice the area [m²]."""
+    """(F, 3) cross product of each triangle: outward, its length twice the area [m²].
+
+    vertices : (V, 3) m. triangles : (F, 3).
+    """
     a, b, c = (vertices[triangles[:, i]] for i in range(3))
     return np.cross(b - a, c - a)
 
 
 def vertex_sums(values: NDArray, triangles: Int, count: int) -> Float:
-    """Sum over the triangles at each vertex: (F,) or (F, C) -> (count,) or (count, C)."""
+    """Sum over the triangles (F, 3) at each vertex of values (F,) or (F, C), any unit: (count,) or (count, C)."""
     columns = values.reshape(len(triangles), -1)
     corners = triangles.ravel()
     out: Float = np.stack([np.bincount(corners, np.repeat(c, 3).astype(np.float64), count) for c in columns.T], axis=1)
@@ -52,7 +55,7 @@ def vertex_sums(values: NDArray, triangles: Int, count: int) -> Float:
 
 
 def vertex_areas(vertices: Float32, triangles: Int) -> Float:
-    """(V,) m²: a third of the area of the triangles at each vertex."""
+    """(V,) m²: a third of the area of the triangles (F, 3) at each of the vertices (V, 3) m."""
     return vertex_sums(np.linalg.norm(triangle_normals(vertices, triangles), axis=1) / 6, triangles, len(vertices))
 
 
@@ -75,7 +78,10 @@ def undirected_edges(triangles: Int) -> tuple[Int, Bool]:
 
 
 def keep_vertices(vertices: Float32, triangles: Int, keep: Bool) -> tuple[Float32, Int]:
-    """The triangles whose three vertices are all kept, and the vertices these use; order is preserved."""
+    """The triangles whose three vertices are all kept, and the vertices these use; order is preserved.
+
+    vertices : (V, 3) m. triangles : (F, 3). keep : (V,) mask.
+    """
     tri = triangles[keep[triangles].all(1)]
     used = np.zeros(len(vertices), bool)
     used[tri] = True
@@ -88,6 +94,7 @@ def close_pinholes(vertices: Float32, triangles: Int, max_round_m: float) -> Int
 
     A pinhole is a voxel that too few frames filled. It is no edge of the subject, but would be taken for one wherever
     silhouettes and open borders are kept clear of. No vertex is added. Holes that touch in a vertex stay open.
+    vertices : (V, 3) m. triangles : (F, 3).
     """
     n = len(vertices)
     ends = (triangles.ravel(), triangles[:, [1, 2, 0]].ravel())
@@ -114,7 +121,10 @@ def close_pinholes(vertices: Float32, triangles: Int, max_round_m: float) -> Int
 
 
 def smooth_positions(vertices: Float32, triangles: Int, iterations: int) -> Float32:
-    """Taubin smoothing: `iterations` pairs of a shrinking and an inflating step. Vertices (V, 3) m."""
+    """Taubin smoothing: `iterations` pairs of a shrinking and an inflating step.
+
+    vertices and the result : (V, 3) m. triangles : (F, 3).
+    """
     if iterations == 0:
         return vertices
     mean = _average(triangles, len(vertices), self_weight=0.0)
@@ -129,6 +139,7 @@ def mesh_normals(vertices: Float32, triangles: Int, *, steps: int = 2) -> Float3
     """Unit outward normals (V, 3): area-weighted triangle normals, averaged over the neighbours `steps` times.
 
     They never mix a finger with its neighbour, but an irregular mesh makes them less exact than a plane fit.
+    vertices : (V, 3) m. triangles : (F, 3).
     """
     n = vertex_sums(triangle_normals(vertices, triangles), triangles, len(vertices)).astype(np.float32)
     mean = _average(triangles, len(vertices), self_weight=1.0)

@@ -50,7 +50,7 @@ class OutlineCaster:
         self._rays = pixel_rays(camera, u, v).astype(np.float32)
 
     def contour(self, T_world_thermal: Float) -> Contour:
-        """The outline against the background, as seen from a pose of the thermal camera."""
+        """The outline against the background, as seen from T_world_thermal (4, 4)."""
         rays = self._rays @ T_world_thermal[:3, :3].T.astype(np.float32)
         eye = T_world_thermal[:3, 3].astype(np.float32)
         hit = self._scene.hits(rays_from(eye, rays.reshape(-1, 3))).distance.reshape(rays.shape[:2])
@@ -109,7 +109,10 @@ class ProjectedContour:
 
 
 def project_contour(camera: Camera, T_thermal_world: Float, contour: Contour) -> ProjectedContour:
-    """A contour in the image of a camera, distortion included; NaN where a point lies outside the camera's model."""
+    """A contour in px in a camera's image, distortion included; NaN where a point lies outside the camera's model.
+
+    T_thermal_world : (4, 4).
+    """
     p = transform_points(T_thermal_world, contour.point_m)
     h = 1e-6
     uv, _ = project(camera, np.concatenate([p, p + np.array([h, 0, 0]), p + np.array([0, h, 0])]))

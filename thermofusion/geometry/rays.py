@@ -75,5 +75,5 @@ class RayScene:
 
 
 def rays_from(origin_m: NDArray, direction: NDArray) -> Float32:
-    """Rays (N, 6) from one origin (3,) m, or one each (N, 3), along directions (N, 3)."""
+    """Rays (N, 6) from origin_m, one (3,) m or one each (N, 3), along direction (N, 3); float32."""
     return np.concatenate([np.broadcast_to(origin_m, direction.shape), direction], axis=1, dtype=np.float32)

@@ -1,7 +1,6 @@
-"""Rigid motions and the pinhole camera: pure NumPy (and SciPy's rotations).
+"""Rigid motions and trajectories: NumPy and SciPy's rotations.
 
-Frames: `T_a_b` (4x4) takes a point from frame b to frame a, p_a = T_a_b p_b. Camera: x right, y down, z forward; the
-centre of the first pixel is (0, 0) (paper Eqs. 2-8, with OpenCV's coefficient order).
+`T_a_b` (4x4) takes a point from frame b to frame a, p_a = T_a_b p_b.
 """
 
 from __future__ import annotations
@@ -11,8 +10,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..types import Bool, Float, Trajectory
-
-# ---------------------------------------------------------------- rigid motions
 
 
 def invert(T: Float) -> Float:
@@ -26,13 +23,13 @@ def invert(T: Float) -> Float:
 
 
 def transform_points(T_b_a: Float, points_a: NDArray) -> NDArray:
-    """Points (N, 3) of frame a in frame b; keeps the points' float type."""
+    """points_a (N, 3) m of frame a in frame b by T_b_a (4, 4); keeps the points' float type."""
     R, t = T_b_a[:3, :3].astype(points_a.dtype), T_b_a[:3, 3].astype(points_a.dtype)
     return points_a @ R.T + t
 
 
 def pose(R: NDArray, t: NDArray) -> Float:
-    """(4, 4) from a rotation matrix and a translation in metres."""
+    """(4, 4) from a rotation matrix R (3, 3) and a translation t (3,) in metres."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, t
     return T
@@ -57,7 +54,7 @@ def se3_exp(xi: NDArray) -> Float:
 
 
 def se3_log(T: Float) -> Float:
-    """Inverse of `se3_exp`: (..., 4, 4) -> (..., 6)."""
+    """Inverse of `se3_exp`: T (..., 4, 4) -> (..., 6), rotation vector [rad] and translation part [m]."""
     T = np.asarray(T, np.float64)
     w = Rotation.from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).as_rotvec().reshape(*T.shape[:-2], 3)
     theta = np.linalg.norm(w, axis=-1)[..., None, None]
@@ -104,7 +101,10 @@ def interpolate_trajectory(trajectory: Trajectory, times_s: Float, *, max_gap_s:
 
 
 def rigid_alignment(source: Float, target: Float) -> Float:
-    """T_target_source minimising Σ|T p - q|² over paired points (N, 3) (Kabsch / Umeyama without scale)."""
+    """T_target_source minimising Σ|T p - q|² over paired points p of source and q of target, (N, 3) m each.
+
+    Kabsch's and Umeyama's solution, without scale.
+    """
     cs, ct = source.mean(0), target.mean(0)
     U, _, Vt = np.linalg.svd((source - cs).T @ (target - ct))
     d = np.sign(np.linalg.det(Vt.T @ U.T))

@@ -311,12 +311,13 @@ def write_comparison(comparison: Comparison, folder: Path) -> list[Path]:
     """`comparison.json`, `bland-altman.svg` and, for surfaces, pictures of the difference; each whole or not at all."""
     from ..files.json import to_json
     from ..files.whole import write_text
-    from ..report.pictures import render_scalar, write_png
+    from ..report.pictures import difference_scale, render_scalar, write_png
 
     write_text(folder / "bland-altman.svg", bland_altman_svg(comparison))
     written = [folder / "bland-altman.svg"]
     if comparison.mesh is not None and comparison.difference_K is not None:
-        pictures = render_scalar(comparison.mesh, comparison.difference_K, "Difference", "K", symmetric=True)
+        scale = difference_scale(comparison.difference_K, "Difference", "K")
+        pictures = render_scalar(comparison.mesh, comparison.difference_K, scale)
         written.append(write_png(folder / "difference.png", pictures["overview"]))
     write_text(folder / "comparison.json", to_json(comparison.report()))
     return [*written, folder / "comparison.json"]

@@ -9,8 +9,7 @@ import numpy as np
 from ..files.shipped import data_dir
 from ..physics.band import Band
 from ..physics.emissivity import COSINE_EPSILON0, HALE_QUERRY_1973, Fresnel, fresnel_reflectivity, water
-from ..report.plot import DASHED, GREEN, INK, Axis, Line, Plot, Points, Polar
-from ..report.plot import Band as Area
+from ..report.plot import DASHED, GREEN, INK, Area, Axis, Line, Plot, Points, Polar
 from ..types import Float
 from .models import SKIN, STYLE
 from .prepared import Prepared

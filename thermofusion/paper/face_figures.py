@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from ..export import palettes
 from ..report.casts import Cast, cast_views
-from ..report.pictures import Scale, paint
+from ..report.lettering import Scale
+from ..report.pictures import paint
 from ..report.plot import BLUE, GREY, ORANGE, Axis, Bar, Line, Picture, Plot, Points
 from ..types import Float, Int
 from .laboratory import FACE_ROOM_DEGC, first_picture_degC

@@ -11,7 +11,8 @@ from ..export.axes import axes_of
 from ..physics.emissivity import Cosine
 from ..pipeline import Result
 from ..report.casts import cast_views
-from ..report.pictures import Scale, paint
+from ..report.lettering import Scale
+from ..report.pictures import paint
 from ..report.plot import (
     AMBER,
     BLUE,

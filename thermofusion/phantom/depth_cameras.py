@@ -52,29 +52,41 @@ class DepthCamera:
 
 
 def angle_term(theta: NDArray) -> NDArray:
-    """θ²/(π/2 - θ)² of Nguyen and of Fankhauser, θ clipped."""
+    """θ²/(π/2 - θ)² of Nguyen and of Fankhauser for theta in rad, any shape, clipped; dimensionless."""
     t = np.minimum(theta, MAX_MODEL_ANGLE)
     return (t / (np.pi / 2 - t)) ** 2
 
 
 def sigma_kinect_v1(z: NDArray, theta: NDArray) -> NDArray:
-    """Nguyen 2012: 1.2 mm + 1.9 mm (z - 0.4)² + 0.1 mm / √z · θ²/(π/2 - θ)²; the last beyond 10° only."""
+    """Nguyen 2012: 1.2 mm + 1.9 mm (z - 0.4)² + 0.1 mm / √z · θ²/(π/2 - θ)²; the last beyond 10° only.
+
+    z in m and theta in rad broadcast; the result is one sigma in m.
+    """
     tilt = np.where(theta > np.radians(10), 0.0001 / np.sqrt(z) * angle_term(theta), 0.0)
     return 0.0012 + 0.0019 * (z - 0.4) ** 2 + tilt
 
 
 def sigma_kinect_v2(z: NDArray, theta: NDArray) -> NDArray:
-    """Fankhauser 2015, indoors: 1.5 - 0.5 z + 0.3 z² + 0.1 z^1.5 θ²/(π/2 - θ)² in mm."""
+    """Fankhauser 2015, indoors: 1.5 - 0.5 z + 0.3 z² + 0.1 z^1.5 θ²/(π/2 - θ)² in mm.
+
+    z in m and theta in rad broadcast; the result is one sigma in m.
+    """
     return 1e-3 * (1.5 - 0.5 * z + 0.3 * z**2 + 0.1 * z**1.5 * angle_term(theta))
 
 
 def sigma_azure(z: NDArray, theta: NDArray) -> NDArray:
-    """1.2 - 0.2 z + 0.12 z² mm and the v2's angle term (see the module's remark)."""
+    """1.2 - 0.2 z + 0.12 z² mm and the v2's angle term (see the module's remark).
+
+    z in m and theta in rad broadcast; the result is one sigma in m.
+    """
     return 1e-3 * (1.2 - 0.2 * z + 0.12 * z**2 + 0.1 * z**1.5 * angle_term(theta))
 
 
 def sigma_d435(z: NDArray, theta: NDArray) -> NDArray:
-    """Intel: z² · 0.08 px / (f · 50 mm) at 848 x 480 (f = 424 px for 90°); oblique patches match worse, 1/cosθ."""
+    """Intel: z² · 0.08 px / (f · 50 mm) at 848 x 480 (f = 424 px for 90°); oblique patches match worse, 1/cosθ.
+
+    z in m and theta in rad broadcast; the result is one sigma in m.
+    """
     return z**2 * 0.08 / (424 * 0.050) / np.cos(np.minimum(theta, MAX_MODEL_ANGLE))
 
 
@@ -179,7 +191,7 @@ def _cut_edges(
 
 
 def depth_edges(z: Float32) -> Bool:
-    """Pixels with a step of depth to a neighbour (nothing counts as far away)."""
+    """Mask (H, W) of pixels with a step of depth z (H, W) m to a neighbour (nothing counts as far away)."""
     far = np.where(np.isfinite(z), z, 99.0).astype(np.float32)
     kernel = np.ones((3, 3), np.uint8)
     return cv2.dilate(far, kernel) - cv2.erode(far, kernel) > EDGE_M

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from ..types import Float
 
 # CODATA 2018, exact
-PLANCK_H = 6.62607015e-34
-LIGHT_C = 299792458.0
-BOLTZMANN = 1.380649e-23
+PLANCK_H = 6.62607015e-34  # J s
+LIGHT_C = 299792458.0  # m/s
+BOLTZMANN = 1.380649e-23  # J/K
 
 QUADRATURE_NODES = 48  # Gauss-Legendre over the band: Planck is smooth, the error is far below 1e-9
 TABLE_STEP_K = 0.02  # linear interpolation between table nodes errs by less than 1 µK
-TABLE_RANGE_DEGC = (-60.0, 200.0)
+TABLE_RANGE_DEGC = (-60.0, 200.0)  # of the table; outside it the ends' values hold
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,11 +40,11 @@ class Band:
         return cls(t, planck_in_band(t, band_um))
 
     def emit(self, degC: NDArray) -> Float:
-        """Temperature in °C -> radiance."""
+        """Temperature in °C -> radiance, W m-2 sr-1; any shape."""
         return np.interp(degC, self.degC, self.radiance)
 
     def invert(self, radiance: NDArray) -> Float:
-        """Radiance -> temperature in °C."""
+        """Radiance, W m-2 sr-1 -> temperature in °C; any shape."""
         return np.interp(radiance, self.radiance, self.degC)
 
     def slope(self, degC: float) -> float:
@@ -53,7 +53,7 @@ class Band:
 
 
 def planck_in_band(degC: NDArray, band_um: tuple[float, float]) -> Float:
-    """∫ 2hc²/λ⁵ / (exp(hc/λkT) - 1) dλ, W m-2 sr-1, by Gauss-Legendre quadrature."""
+    """∫ 2hc²/λ⁵ / (exp(hc/λkT) - 1) dλ, W m-2 sr-1, by Gauss-Legendre quadrature; degC of any shape, band_um in µm."""
     x, w = np.polynomial.legendre.leggauss(QUADRATURE_NODES)
     lo, hi = (1e-6 * b for b in band_um)
     lam = (lo + hi) / 2 + (hi - lo) / 2 * x
@@ -66,7 +66,7 @@ def fresnel_emissivity(cos_angle: NDArray, n: float, k: float = 0.0) -> Float:
     """ε(θ) = 1 - (|r_s|² + |r_p|²)/2 of a smooth surface with complex index n + ik in air (Born & Wolf §1.5, §14.2).
 
     In wave-vector form: q = sqrt(m² - sin²θ) is the normal component inside; r_s = (c - q)/(c + q),
-    r_p = (m²c - q)/(m²c + q), with c = cosθ.
+    r_p = (m²c - q)/(m²c + q), with c = cosθ. cos_angle : any shape.
     """
     c = np.clip(np.asarray(cos_angle, np.float64), 0.0, 1.0).astype(np.complex128)
     m2 = complex(n, k) ** 2

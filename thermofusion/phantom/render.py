@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from ..geometry._open3d import o3d
 from ..geometry.rigid import invert
 from ..types import Bool, Camera, Float, Float32
 from .physics import Band
@@ -19,7 +18,7 @@ from .skin import Covering
 
 RAY_START_M = 2e-4  # a ray that leaves a surface starts this far from it
 MARGIN_PX = 12  # around the subject's outline, for lens distortion and breathing
-FLOOR_EPSILON = 0.95
+FLOOR_EPSILON = 0.95  # emissivity of the floor, at every angle
 UNDISTORT_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-9)  # pixels
 
 
@@ -27,17 +26,23 @@ class Caster:
     """Rays against one triangle mesh (Embree through Open3D)."""
 
     def __init__(self, vertices_m: NDArray, triangles: NDArray) -> None:
+        from ..geometry._open3d import o3d
+
+        self._tensor = o3d.core.Tensor
         self._scene = o3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(
-            o3d.core.Tensor(np.ascontiguousarray(vertices_m, np.float32)),
-            o3d.core.Tensor(np.ascontiguousarray(triangles, np.uint32)),
+            self._tensor(np.ascontiguousarray(vertices_m, np.float32)),
+            self._tensor(np.ascontiguousarray(triangles, np.uint32)),
         )
 
     def hits(self, origins: NDArray, directions: NDArray) -> tuple[Float32, NDArray[np.int64], Float32]:
-        """Distance in units of the direction's length (inf = none), triangle, barycentric (u, v) of rays (N, 3)."""
+        """First hits of rays from origins, (3,) or (N, 3) m, along directions (N, 3).
+
+        Returns distance (N,) in lengths of the direction (inf = none), triangle index (N,), barycentric u, v (N, 2).
+        """
         origins = np.broadcast_to(origins, directions.shape)
         rays = np.concatenate([origins, directions], 1).astype(np.float32)
-        answer = self._scene.cast_rays(o3d.core.Tensor(rays))
+        answer = self._scene.cast_rays(self._tensor(rays))
         return (
             answer["t_hit"].numpy(),
             answer["primitive_ids"].numpy().astype(np.int64),
@@ -45,10 +50,10 @@ class Caster:
         )
 
     def blocked(self, origins: NDArray, targets: NDArray) -> Bool:
-        """Whether something stands between pairs of points (N, 3)."""
+        """Mask (N,): something stands between origins (N, 3) m and targets, (3,) or (N, 3) m."""
         targets = np.broadcast_to(targets, origins.shape)
         rays = np.concatenate([origins, targets - origins], 1).astype(np.float32)
-        return self._scene.test_occlusions(o3d.core.Tensor(rays), 0.0, 1.0).numpy()
+        return self._scene.test_occlusions(self._tensor(rays), 0.0, 1.0).numpy()
 
 
 def corner_weights(uv: Float32) -> Float32:
@@ -133,7 +138,7 @@ def interpolate(values: NDArray, corners: NDArray, weights: NDArray) -> NDArray:
 
 
 def dominant(labels: NDArray, corners: NDArray, weights: NDArray) -> NDArray:
-    """The label of the nearest corner."""
+    """(N,) of labels (V,), the nearest corner's: corners (N, 3) vertex indices, weights (N, 3) barycentric."""
     if not labels.any():
         return np.zeros(len(corners), labels.dtype)
     return labels[corners[np.arange(len(corners)), weights.argmax(1)]]
@@ -168,7 +173,7 @@ class Hits:
 
 
 def image_rays(camera: Camera, supersample: int = 1) -> Float:
-    """Directions with z = 1 through every sample of the image, (sH, sW, 3), by OpenCV's own undistortion."""
+    """Directions (S·H, S·W, 3) with z = 1, through S x S samples a pixel, by OpenCV's own undistortion."""
     s = supersample
     h, w = camera.shape
     at = lambda n: (np.arange(n * s) + 0.5) / s - 0.5  # noqa: E731
@@ -181,7 +186,7 @@ def image_rays(camera: Camera, supersample: int = 1) -> Float:
 
 
 def subject_hits(subject: Subject, camera: Camera, rays: Float, T_body_camera: Float) -> Hits:
-    """Cast the pixels that can see the subject."""
+    """The pixels that see the subject: rays (S·H, S·W, 3) with z = 1, T_body_camera (4, 4) m."""
     where = _candidates(subject.mesh, camera, rays.shape[:2], T_body_camera)
     R, eye = T_body_camera[:3, :3], T_body_camera[:3, 3]
     direction = rays.reshape(-1, 3)[where] @ R.T
@@ -215,7 +220,10 @@ def _candidates(mesh: Mesh, camera: Camera, shape: tuple[int, int], T_body_camer
 
 
 def room_distance(room: RoomConfig, rays: Float, T_world_camera: Float) -> tuple[Float32, Bool]:
-    """Depth z (sH, sW) of floor and round wall, inf = open space; and which samples see the floor."""
+    """Depth z (S·H, S·W) m of floor and round wall, inf = open space; and a mask (S·H, S·W) of what sees the floor.
+
+    rays : (S·H, S·W, 3) with z = 1. T_world_camera : (4, 4).
+    """
     z, floor = np.full(rays.shape[:2], np.inf), np.zeros(rays.shape[:2], bool)
     if room.wall_radius_m is None and not room.floor:
         return z.astype(np.float32), floor
@@ -239,7 +247,8 @@ def render_depth(
 ) -> tuple[Float32, Float32, Bool]:
     """(H, W): true z in metres (NaN = nothing), angle to the normal in rad, and whether the projector's light misses.
 
-    T_body, T_world : T_body_depth and T_world_depth. The projector stands `baseline_m` to the camera's right.
+    rays : (H, W, 3) with z = 1. T_body, T_world : (4, 4) T_body_depth and T_world_depth. The projector stands
+    `baseline_m` to the camera's right.
     """
     z, floor = room_distance(room, rays, T_world)
     cos_floor = np.abs(rays @ T_world[2, :3]) / np.linalg.norm(rays, axis=-1)
@@ -259,8 +268,9 @@ def render_depth(
 def render_thermal(
     subject: Subject, camera: Camera, rays: Float, room: RoomConfig, band: Band, T_body: Float, T_world: Float
 ) -> Float32:
-    """Radiance at the lens on the supersampled grid, W m-2 sr-1 (T_body_thermal, T_world_thermal).
+    """Radiance (S·H, S·W) at the lens on the supersampled grid, W m-2 sr-1.
 
+    rays : (S·H, S·W, 3) with z = 1. T_body, T_world : (4, 4) T_body_thermal and T_world_thermal.
     L = τ [ε(θ) L(T) + (1 - ε(θ)) H] + (1 - τ) L(T_air), θ between the sample's own ray and the smooth normal, H the
     mean radiance the point receives.
     """
@@ -285,7 +295,10 @@ def render_thermal(
 def render_color(
     subject: Subject, camera: Camera, rays: Float, room: RoomConfig, T_body: Float, T_world: Float, texture: Texture
 ) -> NDArray[np.uint8]:
-    """A shaded picture (H, W, 3) sRGB in R, G, B order: Lambert under two lamps, skin with freckles and blotches."""
+    """A shaded picture (H, W, 3) sRGB in R, G, B order: Lambert under two lamps, skin with freckles and blotches.
+
+    rays : (H, W, 3) with z = 1. T_body, T_world : (4, 4) T_body_color and T_world_color.
+    """
     z, floor = room_distance(room, rays, T_world)
     image = np.full((*z.shape, 3), 0.18)
     image[floor] = [0.22, 0.20, 0.18]

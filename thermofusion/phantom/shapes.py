@@ -23,7 +23,7 @@ SHOULDER = np.array([0.185, 0.005, 1.390])
 ELBOW = np.array([0.360, 0.005, 1.215])
 WRIST = np.array([0.488, -0.205, 1.075])
 HIP = np.array([0.095, 0.010, 0.900])
-NECK_Z = 1.455
+NECK_Z = 1.455  # m, height of the cut below the head
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,7 @@ def _finish(v: Float, f: NDArray, config: ShapeConfig) -> Mesh:
 
 
 def vertex_normals(v: NDArray, f: NDArray) -> Float:
-    """Area-weighted unit normals of the vertices, (V, 3)."""
+    """Area-weighted unit normals (V, 3) of vertices v (V, 3) with triangles f (F, 3)."""
     face = np.cross(v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]]).astype(np.float64)
     n = np.stack([np.bincount(f.ravel(), np.repeat(face[:, i], 3), len(v)) for i in range(3)], 1)
     return n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-12)
@@ -126,7 +126,7 @@ def _stitch(rings: Float) -> tuple[Float, NDArray]:
 
 
 def compact(v: NDArray, f: NDArray) -> tuple[Float, NDArray]:
-    """Drop vertices that no triangle uses."""
+    """Vertices v (V, 3) m without those that no triangle uses, and triangles f (F, 3) with their new indices."""
     used, inverse = np.unique(f, return_inverse=True)
     return np.asarray(v[used], np.float64), inverse.reshape(-1, 3)
 
@@ -268,7 +268,11 @@ def _turn(v: Float, weight: Float, joint: Float, rotation: Rotation) -> Float:
 
 
 def cut(v: Float, f: NDArray, point: Float, normal: Float, *, near: Float) -> tuple[Float, NDArray]:
-    """Keep the surface on the side `normal` of a plane, the connected part at `near`, closed with a flat cap."""
+    """Keep the surface on the side `normal` of a plane, the connected part at `near`, closed with a flat cap.
+
+    point : (3,) m, on the plane. normal : (3,). near : (3,) m. v, f and the result: vertices (V, 3) m, triangles (F,
+    3).
+    """
     normal = normal / np.linalg.norm(normal)
     side = (v - point) @ normal
     f = f[(side[f] > 0).all(1)]
@@ -293,7 +297,10 @@ def _part_near(v: Float, f: NDArray, near: Float) -> NDArray[np.bool_]:
 
 
 def subdivide(v: Float, f: NDArray) -> tuple[Float, NDArray]:
-    """One step of Loop's smooth subdivision of a closed mesh (Loop 1987): every triangle becomes four."""
+    """One step of Loop's smooth subdivision of a closed mesh (Loop 1987): every triangle becomes four.
+
+    v : (V, 3) m, f : (F, 3); returned as v and edges' middles (V + E, 3) m and (4 F, 3).
+    """
     n = len(v)
     edges = np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]])
     opposite = np.concatenate([f[:, 2], f[:, 0], f[:, 1]])

@@ -32,7 +32,7 @@ from .walk import Motion, color_rig, held_up, thermal_rig
 from .writing import camera_json, whole_folder, write_frames, write_image, write_json, write_trajectory
 
 BREATH_LEVELS = 12  # the breathing surface is cast in so many steps: 0.4 mm apart for 5 mm
-COLOR_DISTORTION = (0.045, -0.11, 0.0007, -0.0009, 0.03)
+COLOR_DISTORTION = (0.045, -0.11, 0.0007, -0.0009, 0.03)  # k1 k2 p1 p2 k3
 
 # one random stream for each purpose: adding a colour camera must not change the thermal noise
 SEED_SKIN, SEED_EXCHANGE, SEED_MOTION, SEED_RIG, SEED_DRIFT, SEED_DEPTH, SEED_THERMAL, SEED_TEXTURE = range(8)
@@ -162,13 +162,13 @@ class Studio:
         return self.subjects[int(np.clip(round((height + 1) / 2 * (n - 1)), 0, n - 1))]
 
     def poses(self, time_s: float, T_camera_depth: Float | None = None) -> tuple[Float, Float]:
-        """T_body_camera and T_world_camera at a time."""
+        """T_body_camera and T_world_camera (4, 4) at a time; T_camera_depth (4, 4), None = the depth camera itself."""
         t, T_depth_camera = np.array([time_s]), np.eye(4) if T_camera_depth is None else invert(T_camera_depth)
         motion = self.phantom.motion
         return motion.T_body_depth(t)[0] @ T_depth_camera, motion.T_world_depth(t)[0] @ T_depth_camera
 
     def depth(self, i: int) -> np.ndarray:
-        """The i-th depth image, uint16 mm."""
+        """The i-th depth image (H, W), uint16 mm."""
         p, t = self.phantom, float(self.phantom.depth_times_s[i])
         T_body, T_world = self.poses(t)
         baseline = p.depth.baseline_m if p.depth.noisy else 0.0
@@ -178,7 +178,7 @@ class Studio:
         return measure_depth(p.depth, z, theta, shadow, p.rng(SEED_DEPTH, i))
 
     def radiance(self, i: int) -> np.ndarray:
-        """What reaches the thermal lens in frame i, supersampled, W m-2 sr-1 (float32)."""
+        """What reaches the thermal lens in frame i, supersampled: (S·H, S·W) float32, W m-2 sr-1."""
         p, t = self.phantom, float(self.phantom.thermal_times_s[i])
         T_body, T_world = self.poses(t, p.T_thermal_depth)
         image = render_thermal(
@@ -191,14 +191,14 @@ class Studio:
         return image
 
     def thermal(self, i: int) -> np.ndarray:
-        """The i-th thermal image, uint16 counts."""
+        """The i-th thermal image (H, W), uint16 counts."""
         p, rng = self.phantom, self.phantom.rng(SEED_THERMAL, i)
         if p.shutter[i]:
             return shutter_image(p.thermal, rng)
         return expose(p.thermal, self.radiance(i), float(p.offsets_K[i]), rng)
 
     def color(self, i: int) -> np.ndarray:
-        """The colour image at depth frame i, (H, W, 3) R, G, B."""
+        """The colour image at depth frame i, (H, W, 3) sRGB in R, G, B order."""
         p, t = self.phantom, float(self.phantom.depth_times_s[i])
         assert p.color is not None
         assert self.color_rays is not None

@@ -41,7 +41,7 @@ def cover(mesh: Mesh, scene: SceneConfig, rng: np.random.Generator) -> Covering:
 
 
 def emissivity_row(material: MaterialConfig) -> Float32:
-    """ε at cosθ = linspace(0, 1, EMISSIVITY_NODES)."""
+    """ε (EMISSIVITY_NODES,) at the cosines linspace(0, 1, EMISSIVITY_NODES)."""
     if material.model == "diffuse":
         return np.full(EMISSIVITY_NODES, material.epsilon, np.float32)
     cos_angle = np.linspace(0, 1, EMISSIVITY_NODES)
@@ -49,7 +49,7 @@ def emissivity_row(material: MaterialConfig) -> Float32:
 
 
 def temperature_field(mesh: Mesh, skin: SkinConfig, rng: np.random.Generator) -> Float:
-    """True temperature of every vertex in °C: smooth pattern, spots, veins, cool extremities."""
+    """(V,) true temperature of every vertex in °C: smooth pattern, spots, veins, cool extremities."""
     p = mesh.vertices_m.astype(np.float64)
     degC = np.full(len(p), skin.mean_degC)
     if skin.smooth_K:
@@ -77,7 +77,7 @@ def random_field(points_m: Float, length_m: float, rng: np.random.Generator) -> 
 
 
 def spread_points(mesh: Mesh, count: int, rng: np.random.Generator) -> Float:
-    """`count` random vertices far from each other (each the farthest of eight candidates), (count, 3)."""
+    """Places (N, 3) m of `count` random vertices far from each other (each the farthest of eight candidates)."""
     chosen: list[Float] = []
     for _ in range(count):
         candidates = mesh.vertices_m[rng.integers(0, len(mesh), 8)].astype(np.float64)

@@ -18,7 +18,7 @@ from .depth_cameras import scaled_camera
 from .physics import Band
 from .scene import BlackbodyConfig, DriftConfig, ThermalConfig
 
-LWIR_DISTORTION = (-0.24, 0.11, 0.0011, -0.0006, -0.02)
+LWIR_DISTORTION = (-0.24, 0.11, 0.0011, -0.0006, -0.02)  # k1 k2 p1 p2 k3: a wide lens's barrel
 REFERENCE_DEGC = 30.0  # NETD, drift and vignetting are given in kelvin at this temperature (the makers' convention)
 BLACKBODY_MARGIN = 1.5  # the source is this much larger than the polygon, so that blur does not reach into it
 SHUTTER_DEGC = 28.0  # a shutter has about the housing's temperature
@@ -74,9 +74,9 @@ def thermal_camera(config: ThermalConfig) -> ThermalCamera:
 
 
 def expose(model: ThermalCamera, scene: Float32, offset_K: float, rng: np.random.Generator) -> NDArray[np.uint16]:
-    """One frame: blur, pixel binning, vignetting, offset, noise, counts.
+    """One frame (H, W) of counts: blur, pixel binning, vignetting, offset, noise, curve.
 
-    scene : (sH, sW) radiance at the lens on the supersampled grid, W m-2 sr-1.
+    scene : (S·H, S·W) radiance at the lens on the supersampled grid, W m-2 sr-1.
     """
     s = model.supersample
     h, w = model.camera.shape
@@ -87,7 +87,7 @@ def expose(model: ThermalCamera, scene: Float32, offset_K: float, rng: np.random
 
 
 def blur(image: NDArray, sigma: float) -> NDArray:
-    """The lens: a Gaussian of `sigma` samples, edges continued."""
+    """The lens: an image (H, W) under a Gaussian of `sigma` samples (px of that image), edges continued."""
     if sigma <= 0:
         return image
     r = int(np.ceil(4 * sigma))
@@ -105,13 +105,13 @@ def vignetting_field(model: ThermalCamera) -> Float:
 
 
 def to_counts(model: ThermalCamera, degC: Float) -> NDArray[np.uint16]:
-    """Invert the curve; whole counts, clipped to 16 bits."""
+    """Invert the curve: degC of any shape to whole counts, clipped to 16 bits."""
     g = np.arange(65536.0)
     return np.clip(np.rint(np.interp(degC, counts_to_degC(model, g), g)), 0, 65535).astype(np.uint16)
 
 
 def counts_to_degC(model: ThermalCamera, counts: NDArray) -> Float:
-    """The written curve."""
+    """The written curve: counts of any shape to °C."""
     curve, g = model.curve, np.asarray(counts, np.float64)
     if curve["type"] == "polynomial":
         coefficients = np.array(curve["coefficients_degC"], np.float64)
@@ -146,7 +146,7 @@ def blackbody_polygon(config: BlackbodyConfig, camera: Camera) -> Float:
 
 
 def paint_blackbody(model: ThermalCamera, config: BlackbodyConfig, scene: Float32, room: float) -> None:
-    """Put the source into the supersampled scene, in place. room : radiance it reflects."""
+    """Put the source into the supersampled scene (S·H, S·W), in place. room : radiance it reflects. W m-2 sr-1."""
     polygon = blackbody_polygon(config, model.camera)
     center, half = polygon.mean(0), BLACKBODY_MARGIN * np.ptp(polygon[:, 0]) / 2
     s = model.supersample
@@ -157,5 +157,5 @@ def paint_blackbody(model: ThermalCamera, config: BlackbodyConfig, scene: Float3
 
 
 def shutter_image(model: ThermalCamera, rng: np.random.Generator) -> NDArray[np.uint16]:
-    """What a frame shows while the shutter is closed: an even surface."""
+    """What a frame shows while the shutter is closed, (H, W) counts: an even surface."""
     return to_counts(model, SHUTTER_DEGC + rng.normal(0, model.netd_K, model.camera.shape))

@@ -13,7 +13,7 @@ from .scene import MotionConfig, RigConfig, WalkConfig
 
 TREMOR_HZ = (0.4, 6.0)  # physiological tremor of an outstretched arm, and the walker's gait
 SWAY_HZ = (0.1, 0.6)  # quiet standing
-MOTION_WAVES = 12
+MOTION_WAVES = 12  # sines a component
 
 # The rig's true extrinsics: the thermal camera above the depth camera, colour beside it.
 THERMAL_TWIST = np.array([-0.05, 0.02, 0.01, 0.018, -0.100, 0.011])
@@ -129,7 +129,7 @@ def held_up(roll_deg: float) -> list[float]:
 
 
 def thermal_rig(rig: RigConfig, rng: np.random.Generator) -> tuple[Float, Float]:
-    """(true, written) T_thermal_depth: they differ by the scene's calibration error in a random direction."""
+    """(true, written) T_thermal_depth, (4, 4) m: they differ by the calibration error in a random direction."""
     true = se3_exp(THERMAL_TWIST)
     axes = rng.standard_normal((2, 3))
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
@@ -138,5 +138,5 @@ def thermal_rig(rig: RigConfig, rng: np.random.Generator) -> tuple[Float, Float]
 
 
 def color_rig() -> Float:
-    """True T_color_depth."""
+    """True T_color_depth, (4, 4) m."""
     return se3_exp(COLOR_TWIST)

@@ -43,7 +43,7 @@ def whole_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
 
 
 def write_image(path: Path, image: NDArray, *, jpeg_quality: int | None = None) -> None:
-    """PNG, or JPEG from R, G, B."""
+    """PNG of an image (H, W) or (H, W, 3) as it is, or JPEG of R, G, B uint8."""
     if jpeg_quality is not None:
         bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
         ok, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality])
@@ -55,7 +55,7 @@ def write_image(path: Path, image: NDArray, *, jpeg_quality: int | None = None) 
 
 
 def write_trajectory(path: Path, times_s: Float, T_world_depth: Float) -> None:
-    """TUM rows `time_s tx ty tz qx qy qz qw`."""
+    """TUM rows `time_s tx ty tz qx qy qz qw` [s, m] of times_s (N,) and T_world_depth (N, 4, 4)."""
     q = Rotation.from_matrix(T_world_depth[:, :3, :3]).as_quat()
     rows = [
         f"{t:.6f} " + " ".join(f"{x:.9f}" for x in (*T[:3, 3], *quat))

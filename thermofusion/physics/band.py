@@ -1,4 +1,4 @@
-"""Signal, in-band radiance, temperature: the measurement equation, forwards and backwards.
+"""Planck in a camera's band: in-band radiance from temperature, and back, by tables.
 
 Inside the method everything is linear in in-band radiance L [W m-2 sr-1]; a temperature is computed once, at the end.
 Formulas, their sources and the golden values stand in docs/radiometry.md.
@@ -14,19 +14,22 @@ from numpy.typing import ArrayLike
 
 from ..types import Float
 
-ZERO_DEGC_K = 273.15
+ZERO_DEGC_K = 273.15  # K at 0 °C, by definition
 _H, _C, _K = 6.62607015e-34, 299792458.0, 1.380649e-23  # CODATA 2018, exact: J s, m/s, J/K
 _C1 = 2 * _H * _C**2  # W m2 sr-1
 _C2 = _H * _C / _K  # m K
 
 TABLE_K = (150.0, 1500.0)  # temperatures a band's table covers; NaN outside
-_STEP_K = 0.5
-_KNOTS = 4096
+_STEP_K = 0.5  # between a table's knots: cubics err by less than 1e-7 of the radiance
+_KNOTS = 4096  # of the inverse table: cubics err by less than 1e-6 K
 _NODES = 64  # Gauss-Legendre: exact to rounding for any thermal band
 
 
 def planck_radiance(wavelength_um: ArrayLike, T_K: ArrayLike) -> Float:
-    """Spectral radiance of a blackbody, W m-2 sr-1 µm-1 (Planck, CODATA 2018 constants)."""
+    """Spectral radiance of a blackbody, W m-2 sr-1 µm-1 (Planck, CODATA 2018 constants).
+
+    wavelength_um in µm and T_K in K broadcast.
+    """
     lam = np.asarray(wavelength_um, np.float64) * 1e-6
     return 1e-6 * _C1 / lam**5 / np.expm1(_C2 / (lam * np.asarray(T_K, np.float64)))
 
@@ -46,7 +49,7 @@ class Band:
             raise ValueError(f"a band from {self.lo_um} to {self.hi_um} µm is none")
 
     def integrate(self, T_K: ArrayLike) -> Float:
-        """In-band radiance by Gauss-Legendre quadrature, W m-2 sr-1, to rounding; `radiance` is fast."""
+        """In-band radiance by Gauss-Legendre quadrature, W m-2 sr-1, to rounding; any shape. `radiance` is fast."""
         lam, w = self._quadrature
         T = np.asarray(T_K, np.float64)
         return np.asarray(planck_radiance(lam, T[..., None]) @ w)
@@ -60,7 +63,7 @@ class Band:
         return _hermite(np.asarray(T_K, np.float64), *self._slope)
 
     def temperature_K(self, L: ArrayLike) -> Float:
-        """Inverse of `radiance`: blackbody temperature, K, to 1e-6 K; NaN outside 150-1500 K."""
+        """Inverse of `radiance`: blackbody temperature of L of any shape, K, to 1e-6 K; NaN outside 150-1500 K."""
         L = np.asarray(L, np.float64)
         with np.errstate(invalid="ignore", divide="ignore"):
             x = np.log(np.where(L > 0, L, np.nan))

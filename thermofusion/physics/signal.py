@@ -1,8 +1,4 @@
-"""Signal, in-band radiance, temperature: the measurement equation, forwards and backwards.
-
-Inside the method everything is linear in in-band radiance L [W m-2 sr-1]; a temperature is computed once, at the end.
-Formulas, their sources and the golden values stand in docs/radiometry.md.
-"""
+"""Stored thermal pixels to apparent in-band radiance, through the camera's curve (docs/radiometry.md)."""
 
 from __future__ import annotations
 
@@ -14,9 +10,6 @@ from ..types import Float, Float32, SignalCurve, ThermalCamera
 from .band import TABLE_K, ZERO_DEGC_K, Band
 
 MAX_UNUSABLE = 0.01  # share of an image's pixels that may lie off the radiometric curve (dead pixels)
-
-
-# ---------------------------------------------------------------- from stored pixels to radiance
 
 
 class SignalConverter:
@@ -89,7 +82,10 @@ class SignalConverter:
 
 
 def counts_to_kelvin(signal: SignalCurve, counts: Float) -> Float:
-    """Apparent temperature of counts through the camera's curve, K; NaN where the curve gives none (paper Eq. 1)."""
+    """Apparent temperature of counts, any shape, through the camera's curve, K (paper Eq. 1).
+
+    NaN where the curve gives none. Raises ScanError for an incomplete or unknown curve.
+    """
     p, place = signal.parameters, "cameras.thermal.signal.curve"
     try:
         with np.errstate(all="ignore"):

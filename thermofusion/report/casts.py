@@ -52,7 +52,7 @@ class Cast:
         return h // RAYS, w // RAYS
 
     def interpolate(self, values: NDArray) -> Float32:
-        """(N,) per-vertex values where the rays hit; NaN where a corner of the triangle has none."""
+        """(N,) where the rays hit, of values (V,) of any unit; NaN where a corner of the triangle has none."""
         v = np.asarray(values, np.float32)[self.corners] * self.weights
         return v[:, 0] + v[:, 1] + v[:, 2]
 

@@ -6,6 +6,7 @@ OpenCV's Hershey fonts know ASCII only: the degree sign is drawn as a small circ
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import cache
 from typing import Literal
 
@@ -16,10 +17,23 @@ from numpy.typing import NDArray
 from ..export.palettes import table
 from ..types import UInt8
 
-INK, QUIET = (34, 34, 38), (110, 110, 116)
+INK, QUIET = (34, 34, 38), (110, 110, 116)  # sRGB of letters and lines, and of what stands back
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 _FINE = 4  # letters are drawn this much larger, then averaged down: smooth at any size
 _STROKES = cv2.__version__.startswith("4")  # OpenCV 4 draws letters with a pen; from 5 on they are outlines
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How values become colours, and what the bar says. Below and above the range, values take the end's colour."""
+
+    palette: str
+    lo: float
+    hi: float
+    unit: str
+    title: str
+    subtitle: str = ""
+    shading: float = 0.0  # 0: off; 1: surface seen edge-on is black
 
 
 def write(
@@ -98,10 +112,7 @@ def tick_label(value: float, marks: list[float]) -> str:
 def color_bar(
     image: UInt8,
     box: tuple[int, int, int, int],
-    palette: str,
-    lo: float,
-    hi: float,
-    unit: str,
+    scale: Scale,
     size_px: float,
     *,
     below: bool = False,
@@ -111,19 +122,19 @@ def color_bar(
 
     below, above : a point at that end tells that values beyond the range are shown in its last colour.
     """
-    x, y, w, h = box
+    (x, y, w, h), lo, hi = box, scale.lo, scale.hi
     rows = np.round(np.linspace(255, 0, h)).astype(np.uint8)
-    image[y : y + h, x : x + w] = table(palette)[rows][:, None]
+    image[y : y + h, x : x + w] = table(scale.palette)[rows][:, None]
     line = max(round(size_px / 12), 1)
     cv2.rectangle(image, (x - 1, y - 1), (x + w, y + h), INK, line, cv2.LINE_AA)
     for at_end, end, sign, index in ((above, y - 1, -1, 255), (below, y + h, 1, 0)):
         if at_end:
             tip = np.array([[x - 1, end], [x + w, end], [x + (w - 1) // 2, end + sign * round(w * 0.7)]], np.int32)
-            cv2.fillPoly(image, [tip], table(palette)[index].tolist(), cv2.LINE_AA)
+            cv2.fillPoly(image, [tip], table(scale.palette)[index].tolist(), cv2.LINE_AA)
             cv2.polylines(image, [tip], True, INK, line, cv2.LINE_AA)
     marks = ticks(lo, hi)
     for value in marks:
         row = round(y + (hi - value) / (hi - lo) * (h - 1))
         cv2.line(image, (x + w, row), (x + w + round(size_px * 0.5), row), INK, line)
         write(image, tick_label(value, marks), x + w + size_px * 0.9, row + size_px / 2, size_px)
-    write(image, unit, x, y - size_px * 0.9 - (round(w * 0.7) if above else 0), size_px)
+    write(image, scale.unit, x, y - size_px * 0.9 - (round(w * 0.7) if above else 0), size_px)

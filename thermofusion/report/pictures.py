@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -22,26 +21,13 @@ from ..files.whole import write_whole
 from ..types import Float, Float32, SurfaceMesh, ThermalMesh, UInt8
 from . import lettering
 from .casts import RAYS, Cast, cast_views
-from .lettering import INK, QUIET
+from .lettering import INK, QUIET, Scale
 
 UNMEASURED_RGB = ((226, 226, 226), (190, 190, 190))  # stripes falling to the left,
 INSIDE_RGB = ((112, 112, 112), (84, 84, 84))  # and to the right: no palette can be mistaken for either
-OUTLINE_RGB, OUTLINE_ALPHA = (40, 40, 44), 0.75
+OUTLINE_RGB, OUTLINE_ALPHA = (40, 40, 44), 0.75  # sRGB and opacity of the line round contours
 CREASE_PX = 10.0  # a step in depth of this many pixels is an edge: a slope of 84° is none
 _LABELS = {"front": "front (toward the first camera)"}
-
-
-@dataclass(frozen=True)
-class Scale:
-    """How values become colours, and what the bar says. Below and above the range, values take the end's colour."""
-
-    palette: str
-    lo: float
-    hi: float
-    unit: str
-    title: str
-    subtitle: str = ""
-    shading: float = 0.0  # 0: off; 1: surface seen edge-on is black
 
 
 def render_views(
@@ -51,49 +37,34 @@ def render_views(
     range_degC: tuple[float, float] | None = None,
     height_px: int = 900,
     shading: float = 0.0,
-    up: ArrayLike | None = None,
-    front: ArrayLike | None = None,
     casts: list[Cast] | None = None,
 ) -> dict[str, UInt8]:
     """Pictures of the temperature: `front`, `back`, `left`, `right` and all four as `overview`; (H, W, 3) sRGB.
 
-    range_degC : None = `palettes.color_range`. shading : 0 = none, for measuring; 0.3 shows the shape. up, front : (3,)
-    in the world frame; None = the mesh's metadata, or else the first depth camera's frame (y down). casts : of
-    `cast_mesh`, where several maps of one surface are drawn. Raises RecipeError, ValueError (no triangles).
+    range_degC : None = `palettes.color_range`. shading : 0 = none, for measuring; 0.3 shows the shape. casts : of
+    `cast_mesh`, where several maps of one surface are drawn or it is seen along other axes. Raises RecipeError,
+    ValueError (no triangles).
     """
     lo, hi = palettes.color_range(mesh.temperature_degC, range_degC)
     level = "level anchored to a reference" if mesh.anchored else "level relative: no reference"
     what = {"absolute": "Skin temperature", "normal-equivalent": "Normal-equivalent temperature"}
     title = what.get(mesh.mode, "Apparent temperature")
     scale = Scale(palette, lo, hi, "°C", title, f"output {mesh.mode}; {level}", shading)
-    casts = casts or cast_mesh(mesh, height_px=height_px, up=up, front=front)
-    return draw(casts, mesh.temperature_degC, scale, height_px=height_px)
+    return draw(casts or cast_mesh(mesh, height_px=height_px), mesh.temperature_degC, scale, height_px=height_px)
 
 
-def render_scalar(
-    mesh: ThermalMesh,
-    values: NDArray,
-    label: str,
-    unit: str,
-    *,
-    palette: str = "cividis",
-    limits: tuple[float, float] | None = None,
-    symmetric: bool = False,
-    height_px: int = 900,
-    shading: float = 0.0,
-    up: ArrayLike | None = None,
-    front: ArrayLike | None = None,
-    casts: list[Cast] | None = None,
-) -> dict[str, UInt8]:
-    """Pictures of any per-vertex quantity (V,), NaN = none: angle, uncertainty, count, difference.
+def render_scalar(mesh: ThermalMesh, values: NDArray, scale: Scale, *, height_px: int = 900) -> dict[str, UInt8]:
+    """Pictures of any quantity (V,) in the scale's unit, NaN = none: angle, uncertainty, count, difference.
 
-    symmetric : range about 0 and, unless another palette is named, blue-white-red. Otherwise as `render_views`.
+    (H, W, 3) sRGB and errors as of `render_views`.
     """
-    if symmetric and palette == "cividis":
-        palette = "difference"
-    lo, hi = palettes.color_range(values, limits, step=_round_step(values), symmetric=symmetric)
-    casts = casts or cast_mesh(mesh, height_px=height_px, up=up, front=front)
-    return draw(casts, values, Scale(palette, lo, hi, unit, label, shading=shading), height_px=height_px)
+    return draw(cast_mesh(mesh, height_px=height_px), values, scale, height_px=height_px)
+
+
+def difference_scale(values: NDArray, title: str, unit: str) -> Scale:
+    """Blue-white-red about 0 for values of any shape, in `unit`; the range is a round number."""
+    lo, hi = palettes.color_range(values, step=_round_step(values), symmetric=True)
+    return Scale("difference", lo, hi, unit, title)
 
 
 def write_views(
@@ -131,7 +102,11 @@ def write_png(path: str | Path, image: UInt8) -> Path:
 def cast_mesh(
     mesh: ThermalMesh, *, height_px: int = 900, up: ArrayLike | None = None, front: ArrayLike | None = None
 ) -> list[Cast]:
-    """The four views of a mesh, to draw several maps from."""
+    """The four views of a mesh, to draw several maps from.
+
+    up, front : (3,) in the world frame, any length; None = the mesh's metadata, or else the first depth camera's frame
+    (y down).
+    """
     axes = axes_of(mesh.metadata)
     if up is not None or front is not None:
         axes = axes_rotation(axes[1] if up is None else up, axes[2] if front is None else front)
@@ -139,12 +114,15 @@ def cast_mesh(
 
 
 def cast_surface(surface: SurfaceMesh, axes: Float, *, height_px: int = 900) -> list[Cast]:
-    """The same before there are temperatures. axes : (3, 3), rows right, up and front (`export.axes_of`)."""
+    """The same before there are temperatures. axes : (3, 3) unit rows right, up and front (`export.axes_of`)."""
     return cast_views(surface, axes, height_px - _Page(height_px).chrome_px)
 
 
 def draw(casts: list[Cast], values: NDArray, scale: Scale, *, height_px: int) -> dict[str, UInt8]:
-    """One page per view, and `overview` with all of them side by side under one bar."""
+    """One page (H, W, 3) sRGB per view, and `overview` with all of them side by side under one bar.
+
+    values : (V,) in the scale's unit, NaN = unmeasured.
+    """
     finite = values[np.isfinite(values)]
     beyond = bool((finite < scale.lo).any()), bool((finite > scale.hi).any())
     legend = ["unmeasured"] if len(finite) < len(values) else []
@@ -253,7 +231,7 @@ class _Page:
         x, y, side, size = image.shape[1] - self.bar + self._px(10), self._px(190), self._px(26), 12 * self.unit
         box = (x, y, side, self.height - y - self._px(170))
         below, above = beyond
-        lettering.color_bar(image, box, scale.palette, scale.lo, scale.hi, scale.unit, size, below=below, above=above)
+        lettering.color_bar(image, box, scale, size, below=below, above=above)
         top = self.height - self._px(122)
         for name in legend:
             image[top : top + side, x : x + side] = _hatch((side, side), inside=name == "inside")

@@ -71,7 +71,7 @@ class Line:
 
 
 @dataclass(frozen=True, eq=False)
-class Band:
+class Area:
     """The area between two curves lo and hi over x, each (N,) in the axes' units."""
 
     x: ArrayLike
@@ -105,7 +105,7 @@ class Rule:
     dash: str = DOTTED
 
 
-Mark = Line | Band | Points | Rule
+Mark = Line | Area | Points | Rule
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +160,7 @@ class Polar:
 
     title: str
     r: Axis
-    marks: Sequence[Line | Band]
+    marks: Sequence[Line | Area]
     angle_step_deg: float = 15.0
 
     def draw(self, width: float, height: float, key: str) -> str:
@@ -292,13 +292,13 @@ def csv_text(columns: Mapping[str, ArrayLike], digits: int = 6) -> str:
 # ---------------------------------------------------------------- elements
 
 
-def _mark(mark: Line | Band | Points, at: Callable[[ArrayLike, ArrayLike], tuple[NDArray, NDArray]]) -> str:
+def _mark(mark: Line | Area | Points, at: Callable[[ArrayLike, ArrayLike], tuple[NDArray, NDArray]]) -> str:
     if isinstance(mark, Line):
         d = _path(*at(mark.x, mark.y))
         dash = f' stroke-dasharray="{mark.dash}"' if mark.dash else ""
         style = f'stroke="{mark.color}" stroke-width="{mark.width:g}" stroke-linejoin="round"{dash}'
         return f'<path d="{d}" fill="none" {style}/>'
-    if isinstance(mark, Band):
+    if isinstance(mark, Area):
         x = np.concatenate([np.asarray(mark.x, np.float64), np.asarray(mark.x, np.float64)[::-1]])
         y = np.concatenate([np.asarray(mark.lo, np.float64), np.asarray(mark.hi, np.float64)[::-1]])
         good = np.isfinite(y)
@@ -365,7 +365,7 @@ def _legend(marks: Iterable[Mark], corner: Corner, left: float, top: float, w: f
     ]
     for i, m in enumerate(entries):
         my = y + 17 + 18 * i - 4
-        if isinstance(m, Band):
+        if isinstance(m, Area):
             at = f'x="{x + 8:.1f}" y="{my - 5:.1f}"'
             parts.append(f'<rect {at} width="24" height="10" fill="{m.color}" fill-opacity="{m.opacity:g}"/>')
         elif isinstance(m, Line):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -34,7 +35,11 @@ def make_stream(
     index: Sequence[int] | NDArray | None = None,
     usable: Sequence[bool] | NDArray | None = None,
 ) -> Stream:
-    """A stream whose times were checked: finite and strictly rising, at least one."""
+    """A stream whose times were checked: finite and strictly rising, at least one.
+
+    times_s : (N,) s. load : i -> image (H, W) or (H, W, 3), as `Stream.load`. index : (N,) the recording's own numbers;
+    None = 0, 1, 2 ... usable : (N,) mask; None = all. Raises ScanError.
+    """
     t = np.asarray(times_s, np.float64)
     numbers = np.arange(len(t)) if index is None else np.asarray(index, np.int64)
     if len(t) == 0:
@@ -49,42 +54,58 @@ def make_stream(
     return Stream(t, load, tuple(str(p) for p in places), numbers, flags)
 
 
+@dataclass(frozen=True, eq=False)
+class ImageFiles:
+    """The image files of one camera, in time order.
+
+    paths, times_s : (N,). place : the file that lists them, or their folder, for messages. index : (N,) the recording's
+    own numbers; None = 0, 1, 2 ... usable : (N,) mask; None = all.
+    """
+
+    kind: Kind
+    paths: Sequence[Path]
+    times_s: Sequence[float] | NDArray
+    place: object
+    index: Sequence[int] | NDArray | None = None
+    usable: Sequence[bool] | NDArray | None = None
+
+
 def image_stream(
-    kind: Kind,
-    files: Sequence[Path],
-    times_s: Sequence[float] | NDArray,
+    files: ImageFiles,
     camera: Camera,
     *,
-    place: object,
     unit_m: float = 0.001,
     invalid: tuple[int, ...] = (0,),
     decode: Callable[[bytes, object], NDArray] | None = None,
-    index: Sequence[int] | NDArray | None = None,
-    usable: Sequence[bool] | NDArray | None = None,
 ) -> Stream:
     """A stream of image files, decoded when asked for.
 
-    unit_m, invalid : of depth. decode : (bytes, place) -> raw image, for files that are no ordinary images.
+    unit_m, invalid : of depth. decode : (bytes, place) -> raw image (H, W) or (H, W, 3) as stored, for files that are
+    no ordinary images.
     """
+    kind, paths = files.kind, files.paths
 
     def load(i: int) -> NDArray:
-        data = read_bytes(files[i], kind)
+        data = read_bytes(paths[i], kind)
         if decode is None:
-            raw = decode_image(data, shape=camera.shape, kind=kind, place=files[i])
+            raw = decode_image(data, shape=camera.shape, kind=kind, place=paths[i])
         else:
-            raw = decode(data, files[i])
+            raw = decode(data, paths[i])
         if raw.shape[:2] != camera.shape:
             raise ScanError(
                 f"the {kind} is {raw.shape[1]} x {raw.shape[0]} px, expected {camera.width_px} x {camera.height_px}",
-                place=files[i],
+                place=paths[i],
             )
-        return as_loaded(kind, raw, files[i], unit_m, invalid)
+        return as_loaded(kind, raw, paths[i], unit_m, invalid)
 
-    return make_stream(times_s, load, files, place=place, kind=kind, index=index, usable=usable)
+    return make_stream(files.times_s, load, paths, place=files.place, kind=kind, index=files.index, usable=files.usable)
 
 
 def as_loaded(kind: Kind, raw: NDArray, place: object, unit_m: float, invalid: tuple[int, ...] = (0,)) -> NDArray:
-    """A decoded image in the form that `Stream.load` promises for its kind."""
+    """A decoded image in the form that `Stream.load` promises for its kind; raw : (H, W), or (H, W, 3) B, G, R uint8.
+
+    unit_m, invalid : of 16-bit depth. Raises ScanError for pixels of another type.
+    """
     if kind == "depth":
         return depth_from_raw(raw, unit_m, place=place, invalid=invalid)
     if kind == "thermal":
@@ -126,7 +147,7 @@ def image_size(path: Path, kind: str) -> tuple[int, int]:
 def make_camera(
     width_px: int, height_px: int, K: NDArray, distortion: NDArray | None = None, *, place: object
 ) -> Camera:
-    """A `Camera`, its faults as ScanError with the place."""
+    """A `Camera` of K (3, 3) px and distortion (5,) or (8,), None = none; its faults as ScanError with the place."""
     try:
         return Camera(width_px, height_px, K, np.zeros(5) if distortion is None else distortion)
     except (ValueError, TypeError) as e:
@@ -155,5 +176,5 @@ def as_thermal(stream: Stream, camera: ThermalCamera) -> ThermalStream:
 
 
 def frame_times(numbers: Sequence[int]) -> Float:
-    """Times of frames that carry only numbers, at the assumed rate."""
+    """Times (N,) in s of frames that carry only numbers, at the assumed rate."""
     return np.asarray(numbers, np.float64) / ASSUMED_RATE_HZ

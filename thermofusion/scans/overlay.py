@@ -14,10 +14,10 @@ from ..geometry.rigid import interpolate_trajectory, invert, transform_points
 from ..types import Bool, Camera, Float, Scan, Stream, UInt8
 from .pairing import nearest_in_time
 
-OVERLAY_FRAMES = 3
+OVERLAY_FRAMES = 3  # spread through the recording
 EDGE_STEP = 0.03  # a neighbour farther away by this share of the range makes an edge
 REACH_PX = 12  # shifts tried
-_GREEN = (0, 255, 0)
+_GREEN = (0, 255, 0)  # sRGB: no grey, no skin
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,10 @@ def depth_edges(depth_m: NDArray) -> Bool:
 
 
 def to_grey(image: NDArray) -> UInt8:
-    """Any image as 8-bit grey, stretched from its 1st to its 99th percentile; for looking at, never for measuring."""
+    """Any image (H, W) or (H, W, 3) as 8-bit grey (H, W), stretched from its 1st to its 99th percentile.
+
+    For looking at, never for measuring.
+    """
     if image.ndim == 3:
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
     x = image.astype(np.float32)
@@ -86,7 +89,10 @@ def to_grey(image: NDArray) -> UInt8:
 
 
 def best_shift(grey: UInt8, edges_px: Float, reach_px: int = REACH_PX) -> tuple[tuple[float, float], float]:
-    """Shift (du, dv) of edge points (N, 2) with the strongest image gradient under them, and its contrast."""
+    """Shift (du, dv) px of edge points with the strongest image gradient under them, and its contrast.
+
+    grey : (H, W). edges_px : (N, 2).
+    """
     g = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 1.5)
     gradient = np.hypot(cv2.Sobel(g, cv2.CV_32F, 1, 0), cv2.Sobel(g, cv2.CV_32F, 0, 1))
     gradient = np.minimum(gradient, np.percentile(gradient, 97))  # one strong edge must not outvote the outline

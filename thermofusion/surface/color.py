@@ -24,6 +24,8 @@ def color_vertices(
 ) -> UInt8 | None:
     """(V, 3) uint8 sRGB of the vertices from up to 30 colour frames, grey where none saw them; None without colour.
 
+    vertices : (V, 3) m. normals : (V, 3) unit.
+
     Every view is projected with the camera's full distortion at the frame's own time; weight cos²θ / range². The mean
     is taken twice, the second time with views that disagree with the first mean weighted down.
     """

@@ -21,8 +21,8 @@ from ..recipe import InputSection, SurfaceSection
 from ..robust import SIGMA_PER_MAD
 from ..types import Camera, Float, Float32, Scan
 
-BLOCK = 8  # voxels along the edge of a block
-BYTES_PER_BLOCK = BLOCK**3 * (8 + 16)  # tsdf and weight, plus the table that mesh extraction builds
+BLOCK_VOXELS = 8  # voxels along the edge of a block
+BYTES_PER_BLOCK = BLOCK_VOXELS**3 * (8 + 16)  # tsdf and weight, plus the table that mesh extraction builds
 SURVEY_FRAMES, SURVEY_SHARE = 16, 1 / 12  # enough for ranges, noise and extent
 NOISE_M_AT_1M = 1.425e-3  # Kinect v1 depth noise is about this times z² (Khoshelham & Elberink 2012)
 NOISE_BOUNDS = (0.4e-3, 6e-3)  # of the coefficient estimated from the data
@@ -32,9 +32,9 @@ TRUNCATION_PER_NOISE = 3.5  # noise is averaged, not cut; what is thinner than t
 FAR_NOISE_PER_TRUNCATION = 0.5  # depth noisier than this share of the truncation would only blur
 FAR_PER_MEDIAN = 1.3  # but nothing nearer than this share of the median range is given up
 MIN_TRUNCATION_VOXELS, MIN_TRUNCATION_M = 2.5, 8e-3  # poses are rarely better than 2 mm
-MAX_VOXEL_M = 0.1
-ESTIMATE_MARGIN = 1.1
-TOUCH_STRIDE_PX, TOUCHES_PER_BLOCK = 4, 3
+MAX_VOXEL_M = 0.1  # larger ones hold no body: then the memory allowed is refused
+ESTIMATE_MARGIN = 1.1  # of the estimated blocks: the table should not have to grow
+TOUCH_STRIDE_PX, TOUCHES_PER_BLOCK = 4, 3  # Open3D looks along every fourth ray; three through a block find it
 GROWTH = 1.3  # of the block table, each time it is full
 
 
@@ -43,7 +43,8 @@ class Frames(Protocol):
 
     camera: Camera
 
-    def read_ahead(self, frames: Sequence[int]) -> Iterator[tuple[int, Float32]]: ...
+    def read_ahead(self, frames: Sequence[int]) -> Iterator[tuple[int, Float32]]:
+        """(i, depth (H, W) m of frame i) in the order given."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +100,7 @@ def survey_depth(scan: Scan, frames: Frames, poses: FramePoses) -> Survey:
 
 
 def depth_noise(images: tuple[Float32, ...] | list[Float32]) -> float:
-    """Depth noise, one sigma in metres at 1 m, growing with range² as a triangulating camera's does.
+    """Depth noise of images (H, W) m, one sigma in metres at 1 m, growing with range² as a triangulating camera's does.
 
     From third differences over 3 px, in which neither slope nor curvature of the surface is left, and noise that is
     correlated over a pixel or two is whole: -z(u) + 3 z(u+3) - 3 z(u+6) + z(u+9) has variance 20 σ². Median absolute
@@ -197,7 +198,7 @@ class VoxelGrid:
         float32 = (o3d.core.float32, o3d.core.float32)
         cpu = o3d.core.Device("CPU:0")
         self._grid = o3d.t.geometry.VoxelBlockGrid(
-            ("tsdf", "weight"), float32, one, plan.voxel_m, BLOCK, max(capacity, 1), cpu
+            ("tsdf", "weight"), float32, one, plan.voxel_m, BLOCK_VOXELS, max(capacity, 1), cpu
         )
         # Open3D takes the pixel whose index is floor(u), which puts the first pixel's centre at (0.5, 0.5). Ours is at
         # (0, 0). Without the shift surfaces lie half a pixel aside: 0.43 instead of 0.23 mm mean error at 1.1 m.
@@ -208,7 +209,7 @@ class VoxelGrid:
         # Open3D looks for blocks along every fourth pixel's ray. A coarse image is enlarged for that: else the corner
         # of a block slips through between rays in most frames, and is a hole in the end.
         stride_m = TOUCH_STRIDE_PX * survey.median_range_m / survey.camera.focal_px
-        self._enlarge = max(1, int(np.ceil(TOUCHES_PER_BLOCK * stride_m / (BLOCK * plan.voxel_m))))
+        self._enlarge = max(1, int(np.ceil(TOUCHES_PER_BLOCK * stride_m / (BLOCK_VOXELS * plan.voxel_m))))
         K_touch = K.copy()
         K_touch[:2] *= self._enlarge
         self._K_touch = o3d.core.Tensor(K_touch)
@@ -219,15 +220,18 @@ class VoxelGrid:
         return int(self._grid.hashmap().size())
 
     def touch(self, depth_m: Float32, T_world_depth: Float) -> NDArray[np.int32]:
-        """(N, 3) coordinates of the blocks within the truncation of a frame's surface."""
+        """(N, 3) coordinates, in blocks, of what is within the truncation of a frame's surface.
+
+        depth_m : (H, W), NaN = none. T_world_depth : (4, 4).
+        """
         depth = self._depth(depth_m)
         return self._blocks(depth, self._o3d.core.Tensor(invert(T_world_depth))).numpy()
 
     def integrate(self, depth_m: Float32, T_world_depth: Float) -> bool:
-        """Average a frame into the field. False, with the field unchanged, if that needs more blocks than allowed.
+        """Average a frame, depth_m (H, W) at T_world_depth (4, 4), into the field.
 
-        The table is enlarged before the blocks go in: one that overflows while they do loses blocks, and the surface
-        gets holes.
+        False, with the field unchanged, if that needs more blocks than allowed. The table is enlarged before the blocks
+        go in: one that overflows while they do loses blocks, and the surface gets holes.
         """
         depth, extrinsic = self._depth(depth_m), self._o3d.core.Tensor(invert(T_world_depth))
         blocks, table = self._blocks(depth, extrinsic), self._grid.hashmap()
@@ -244,7 +248,7 @@ class VoxelGrid:
         return True
 
     def extract(self, min_weight: float) -> tuple[Float32, NDArray[np.int32]]:
-        """Vertices (V, 3) and triangles (F, 3) of the zero level where it was seen at least `min_weight` times."""
+        """Vertices (V, 3) m and triangles (F, 3) of the zero level where it was seen at least `min_weight` times."""
         if self.blocks == 0:
             return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)
         try:  # Open3D wants weights *above* its threshold; they are whole numbers here.

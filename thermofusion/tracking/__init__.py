@@ -1,1 +1,1 @@
-"""Where the depth camera was: `track.track` goes from a scan to a trajectory."""
+"""Where the depth camera was: `track.locate` goes from a scan to a trajectory."""

@@ -13,9 +13,9 @@ from ..types import Float, Float32
 from .frames import TrackingFrame
 from .maps import DepthMap, Intrinsics
 
-SAMPLES = 4000
+SAMPLES = 4000  # points of a fragment that are sent to other views
 SAME_SURFACE_M = 0.02  # depth this far behind the nearest is another surface
-MIN_SHARE = 1 / 3  # of the frames that must see a pixel
+MIN_SEEN_SHARE = 1 / 3  # of the frames that must see a pixel
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,5 +73,5 @@ def _average(pixel: NDArray[np.intp], depth: Float32, size: int, frames: int) ->
     same = depth < nearest[pixel] + np.float32(SAME_SURFACE_M)
     count = np.bincount(pixel[same], minlength=size)
     mean = np.bincount(pixel[same], depth[same], size) / np.maximum(count, 1)
-    needed = min(max(2, int(MIN_SHARE * frames)), frames)
+    needed = min(max(2, int(MIN_SEEN_SHARE * frames)), frames)
     return np.where(count >= needed, mean, np.nan).astype(np.float32)

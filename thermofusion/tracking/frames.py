@@ -24,7 +24,7 @@ MIN_VALID_SHARE = 0.01  # a frame with fewer valid pixels shows nothing
 CELL_SPREAD = 0.03  # relative: pixels of one cell that differ more see two surfaces
 TEXTURE_WINDOW_PX = 15  # of the coarse colour image: intensity is what differs from the mean over this
 CONTRAST_FLOOR = 3.0  # grey levels of local contrast below which texture fades to nothing
-PROBES = 5
+PROBES = 5  # frames that tell distance and shape beforehand
 NEAR_M = 0.7  # nearer subjects are zoomed to 1 m: they are small, and so must every distance be that matters
 SLIDES_BELOW = 0.1  # `stiffness_of` cylinders, spheres and bowls is 0.06 (what noise pretends), of bodies 0.13 to 0.35
 
@@ -128,7 +128,10 @@ def _probes(scan: Scan) -> list[int]:
 
 
 def coarse_depth(depth_m: Float32, step: int) -> Float32:
-    """Mean depth over cells of `step` x `step` pixels, NaN where less than half is valid or two surfaces meet."""
+    """Mean of depth_m (H, W) over cells of `step` x `step` pixels: (H // step, W // step) m.
+
+    NaN where less than half of a cell is valid or two surfaces meet.
+    """
     if step == 1:
         return depth_m
     h, w = (n // step * step for n in depth_m.shape)
@@ -145,7 +148,7 @@ def coarse_depth(depth_m: Float32, step: int) -> Float32:
 
 
 def local_contrast(grey: Float32, step: int) -> Float32:
-    """(I - local mean) / local spread of an image reduced by `step`: what light and exposure leave unchanged."""
+    """(I - local mean) / local spread of `grey` (H, W) reduced by `step`: what light and exposure leave unchanged."""
     size = (grey.shape[1] // step, grey.shape[0] // step)
     image = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     window = (TEXTURE_WINDOW_PX, TEXTURE_WINDOW_PX)

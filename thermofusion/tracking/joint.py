@@ -13,6 +13,7 @@ from .maps import DepthMap
 from .registration import MIN_PARTNERS, find_partners, normal_equations, shape_weights
 
 GOOD_SHARE = 0.4  # of a map's points: smaller overlaps, seen obliquely, serve where there are few better ones
+CONVERGED = 1e-4  # rad and m: far below a voxel
 LOOP_APART = 3  # maps this far apart in time that overlap close a loop
 
 
@@ -25,13 +26,12 @@ def solve_jointly(
     fixed: int = 0,
     stride: int = 1,
     max_iterations: int = 15,
-    tolerance: float = 1e-4,
 ) -> tuple[Float, float, bool]:
     """All poses (F, 4, 4) T_world_map at once, from point-to-plane residuals over all edges (source, target).
 
     The pose graph with its residuals kept instead of summarised: partners are found anew in every step. Pose `fixed`
-    stays; `stride` thins the samples out. Returns (poses, weighted rms in m, converged: last step below `tolerance` rad
-    and m).
+    stays; `stride` thins the samples out. Returns (poses, weighted rms in m, converged: the last step was below 1e-4
+    rad and m).
     """
     T, n, rms = poses.copy(), len(poses), float("nan")
     for _ in range(max_iterations):
@@ -57,7 +57,7 @@ def solve_jointly(
         x[free] = np.linalg.solve(H, b[free])
         T = se3_exp(x.reshape(n, 6)) @ T
         rms = float(np.sqrt(total / weight)) if weight else float("nan")
-        if np.abs(x).max() < tolerance:
+        if np.abs(x).max() < CONVERGED:
             return T, rms, True
     return T, rms, False
 
@@ -73,7 +73,7 @@ def overlapping(
 ) -> list[tuple[int, int]]:
     """Pairs (source, target) of maps that see the same surface: neighbours in the list, and the best others.
 
-    Each map keeps about `per_map` overlaps of at least `min_share` of its points.
+    poses : (F, 4, 4) T_world_map. Each map keeps about `per_map` overlaps of at least `min_share` of its points.
     """
     axis = poses[:, :3, 2]
     near = axis @ axis.T > np.cos(np.radians(max_turn_deg))

@@ -33,7 +33,7 @@ class DepthMap:
 
     @classmethod
     def of(cls, depth_m: Float32, intrinsics: Intrinsics, samples: int, intensity: Float32 | None = None) -> DepthMap:
-        """From a depth image (H, W), metres, NaN = none, and an intensity image of the same view."""
+        """From an image depth_m (H, W), NaN = none, and an intensity image (H, W) of the same view."""
         fx, fy, cx, cy = intrinsics
         h, w = depth_m.shape
         x = ((np.arange(w) - cx) / fx).astype(np.float32)

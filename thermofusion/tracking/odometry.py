@@ -14,15 +14,16 @@ from ..types import Float
 from .fragments import Fragment, build_fragment
 from .frames import TrackingFrame, TrackingFrames
 from .maps import DepthMap, Intrinsics
-from .registration import REACH_M, Partners, agreement, find_partners, register
+from .registration import REACH_M, Partners, agreement, find_partners, register_view
 
+# Reach of partners, one iteration each: from what a fast walk moves in a frame down to what noise spreads.
 REACHES_M = (0.08, 0.05, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03)
 # A second try from standing still, with a far reach: for a jerk that the last motion did not announce.
 RESCUE_REACHES_M = (0.15, 0.15, 0.12, 0.12, 0.1, 0.1, 0.08, 0.06, 0.05, 0.04, 0.03, 0.03, 0.03, 0.03)
 STEP_TOLERANCE = 2e-5  # rad and m: well below what one frame's noise allows
 MIN_AGREEMENT = 0.75  # of what both frames could see, outlines included; neighbours have 0.86 to 1
 MAX_SPEED_M_S, MAX_SPEED_DEG_S = 2.5, 180.0  # faster is no walk: a failure
-MIN_STEP_M, MIN_STEP_DEG = 0.06, 6.0
+MIN_STEP_M, MIN_STEP_DEG = 0.06, 6.0  # always possible, however near in time two frames stand
 MAX_GAP_FRAMES = 5  # empty frames that a segment may step over
 
 
@@ -84,9 +85,9 @@ class GrowingSegment:
         """Append a frame if the motion to it can be believed."""
         if frame.index - self._frames[-1] > MAX_GAP_FRAMES:
             return False
-        dt_s = max(frame.time_s - self._last.time_s, 1e-3)
+        dt_s, last = max(frame.time_s - self._last.time_s, 1e-3), [(self._last.map, np.eye(4))]
         for start, reaches in ((se3_exp(self._velocity * dt_s), REACHES_M), (np.eye(4), RESCUE_REACHES_M)):
-            T_last_now, _ = register(frame.map, [(self._last.map, np.eye(4))], start, reaches, tolerance=STEP_TOLERANCE)
+            T_last_now, _ = register_view(frame.map, last, start, reaches, tolerance=STEP_TOLERANCE)
             partners = find_partners(frame.map, self._last.map, T_last_now, REACH_M)
             believed = _believed(partners, self._tracking) and _possible(T_last_now, dt_s)
             if believed and agreement(frame.map, self._last.map, T_last_now, stride=2) >= MIN_AGREEMENT:
@@ -96,10 +97,12 @@ class GrowingSegment:
         return False
 
     def append_at(self, frame: TrackingFrame, T: Float) -> None:
-        """Append a frame whose pose is known from elsewhere (a recorded trajectory). Within a fragment its motion is
-        still measured: recorded poses may jitter."""
+        """Append a frame whose pose T (4, 4), frame to segment [m], is known from elsewhere (a recorded trajectory).
+
+        Within a fragment its motion is still measured: recorded poses may jitter.
+        """
         start, last = invert(self._T[-1]) @ T, [(self._last.map, np.eye(4))]
-        T_last_now, _ = register(frame.map, last, start, REACHES_M[1:], tolerance=STEP_TOLERANCE)
+        T_last_now, _ = register_view(frame.map, last, start, REACHES_M[1:], tolerance=STEP_TOLERANCE)
         partners = find_partners(frame.map, self._last.map, T_last_now, REACH_M)
         if not _believed(partners, self._tracking):
             T_last_now = start

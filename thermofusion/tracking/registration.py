@@ -19,8 +19,8 @@ from ..types import Float
 from .maps import DepthMap
 
 MAX_NORMAL_DEG = 45.0  # partners must face alike
-MIN_PARTNERS = 150
-NOISE_FLOOR_M = 3e-4
+MIN_PARTNERS = 150  # a twentieth of a frame's points: fewer fix no pose
+NOISE_FLOOR_M = 3e-4  # at 1 m: no spread of residuals is believed to be smaller
 REACH_M = 0.05  # of the partners that judge a motion
 INTENSITY_FLOOR = 0.05  # of the normalised intensity, whose local spread is about 1
 
@@ -66,7 +66,10 @@ class Partners:
 def find_partners(
     source: DepthMap, target: DepthMap, T_target_source: Float, reach_m: float, stride: int = 1
 ) -> Partners:
-    """Partners of the source's sample in the target image, within `reach_m` along and thrice that across."""
+    """Partners of the source's sample in the target image, within `reach_m` along and thrice that across.
+
+    T_target_source : (4, 4). stride : only every so many points.
+    """
     R, t = T_target_source[:3, :3], T_target_source[:3, 3]
     p = source.sample[::stride] @ R.T + t
     pixel, inside, off_px = _pixels(target, p)
@@ -97,8 +100,11 @@ class Seen:
     sent: int
 
 
-def compare(source: DepthMap, target: DepthMap, T_target_source: Float, reach_m: float, stride: int = 1) -> Seen:
-    """Whether the target, from where it is, could have taken its image of the source's points."""
+def seen_from(source: DepthMap, target: DepthMap, T_target_source: Float, reach_m: float, stride: int = 1) -> Seen:
+    """Whether the target, from where it is, could have taken its image of the source's points.
+
+    T_target_source : (4, 4). reach_m, stride : of `find_partners`.
+    """
     partners = find_partners(source, target, T_target_source, reach_m, stride)
     p = source.sample[::stride] @ T_target_source[:3, :3].T + T_target_source[:3, 3]
     n = source.sample_normals[::stride] @ T_target_source[:3, :3].T
@@ -110,8 +116,8 @@ def compare(source: DepthMap, target: DepthMap, T_target_source: Float, reach_m:
 
 
 def agreement(a: DepthMap, b: DepthMap, T_b_a: Float, stride: int = 1) -> float:
-    """Share of what both views could see that agrees, outlines included; 0 where they share nothing."""
-    one, other = compare(a, b, T_b_a, REACH_M, stride), compare(b, a, invert(T_b_a), REACH_M, stride)
+    """Share of what both views see that agrees, outlines included, at T_b_a (4, 4); 0 where they share nothing."""
+    one, other = seen_from(a, b, T_b_a, REACH_M, stride), seen_from(b, a, invert(T_b_a), REACH_M, stride)
     agree = one.agree + other.agree
     return agree / max(agree + one.conflict + other.conflict, 1)
 
@@ -139,7 +145,7 @@ def _color_rows(p: Float, intensity: Float, texture: Float, off_px: Float, fx: f
 
 
 def shape_weights(rows: Rows) -> Float:
-    """Weight of each distance: 1/z⁴ for depth noise, times a Cauchy factor at twice the residuals' spread."""
+    """Weights (N,), m-2: 1/z⁴ for depth noise, times a Cauchy factor at twice the residuals' spread."""
     noise = rows.points[:, 2] ** 2
     return _robust(rows.residual / noise, NOISE_FLOOR_M) / noise**2
 
@@ -171,7 +177,7 @@ def _accumulate(rows: Rows, w: Float, T_world_target: Float) -> tuple[Float, Flo
     return Jw.T @ J, Jw.T @ rows.residual
 
 
-def register(
+def register_view(
     source: DepthMap,
     targets: Sequence[tuple[DepthMap, Float]],
     T_world_source: Float,
@@ -182,8 +188,9 @@ def register(
 ) -> tuple[Float, Partners | None]:
     """Gauss-Newton of one view against fixed others: (T_world_source, partners in the best target at the end).
 
-    reaches_m : one iteration each, from far to near; ends early when a step at the last reach is below `tolerance`
-    rad and m. None for the partners if no target has enough.
+    targets : maps with their T_world_target (4, 4). T_world_source : (4, 4), the start. reaches_m : one iteration
+    each, from far to near; ends early when a step at the last reach is below `tolerance` rad and m. None for the
+    partners if no target has enough.
     """
     T = T_world_source
     last: Partners | None = None

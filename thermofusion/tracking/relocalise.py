@@ -16,20 +16,22 @@ from ..recipe import TrackingSection
 from ..types import Float
 from .fragments import Fragment
 from .maps import DepthMap
-from .registration import REACH_M, compare, register
+from .registration import REACH_M, register_view, seen_from
 
+# Reach of partners, one iteration each.
 COARSE_REACHES_M = (0.2, 0.16, 0.13, 0.1, 0.08, 0.06, 0.05, 0.04)
 FINE_REACHES_M = (0.04, 0.03, 0.03, 0.02, 0.02, 0.02)
+# Walks round the subject that are tried, both ways, near ones first.
 TURNS_DEG = (15, -15, 30, -30, 45, -45, 60, -60, 75, -75, 90, -90, 110, -110, 130, -130, 150, -150, 170, -170)
-MAX_PLACES = 24
+MAX_PLACES = 24  # tried, evenly spread over the fragments: every 15 degrees of a walk round
 FEATURE_VOXELS = 25  # over the subject's extent: a few per cent of it
-RANSAC_ITERATIONS = 60_000
-TARGETS = 3
-SHORTLIST = 6
+RANSAC_ITERATIONS = 60_000  # at most: it ends earlier once 0.999 sure
+TARGETS = 3  # fragments that a hypothesis is aligned with
+SHORTLIST = 6  # hypotheses that are aligned finely
 MIN_SHARED = 0.2  # of the points sent: a join on less is a guess
 MIN_AGREEMENT = 0.85  # right places up to 50 degrees apart have 0.86 to 1, the best wrong ones up to 0.82
 MARGIN = 0.05  # by which another place must agree less
-SAME_PLACE_M, SAME_PLACE_DEG = 0.06, 8.0
+SAME_PLACE_M, SAME_PLACE_DEG = 0.06, 8.0  # hypotheses nearer to each other than this are one
 
 Placed = tuple[Fragment, Float]  # and the pose of its middle frame
 
@@ -91,7 +93,7 @@ def _shortlist(main: Sequence[Placed], probe: Fragment, tries: Sequence[tuple[st
     """The hypotheses (how, T_main_probe), roughly aligned, that agree best; T_main_segment is T_main_probe here."""
     found: list[Join] = []
     for how, T in tries:
-        T, _ = register(probe.map, _targets(main, T), T, COARSE_REACHES_M, stride=4)
+        T, _ = register_view(probe.map, _targets(main, T), T, COARSE_REACHES_M, stride=4)
         join = _judged(main, probe, T, how, stride=4)
         if join is not None and not any(_same_place(join, other) for other in found):
             found.append(join)
@@ -100,7 +102,7 @@ def _shortlist(main: Sequence[Placed], probe: Fragment, tries: Sequence[tuple[st
 
 def _settled(main: Sequence[Placed], probe: Fragment, join: Join, tracking: TrackingSection) -> Join | None:
     """A hypothesis aligned finely, if it still convinces."""
-    T, partners = register(probe.map, _targets(main, join.T_main_segment), join.T_main_segment, FINE_REACHES_M)
+    T, partners = register_view(probe.map, _targets(main, join.T_main_segment), join.T_main_segment, FINE_REACHES_M)
     fine = _judged(main, probe, T, join.how)
     if partners is None or fine is None or fine.agreement < max(MIN_AGREEMENT, tracking.min_fitness):
         return None
@@ -113,7 +115,7 @@ def _judged(main: Sequence[Placed], probe: Fragment, T: Float, how: str, stride:
     for fragment_map, T_map in _targets(main, T):
         ways = ((probe.map, fragment_map, invert(T_map) @ T), (fragment_map, probe.map, invert(T) @ T_map))
         for source, target, T_target_source in ways:
-            seen = compare(source, target, T_target_source, REACH_M, stride)
+            seen = seen_from(source, target, T_target_source, REACH_M, stride)
             agree, conflict, sent = agree + seen.agree, conflict + seen.conflict, sent + seen.sent
             best = max(best, round(1000 * seen.agree / max(seen.sent, 1)))
     if best < 1000 * MIN_SHARED:

@@ -25,14 +25,14 @@ from .fragments import Fragment
 from .frames import TrackingFrames
 from .joint import LOOP_APART, overlapping, solve_jointly
 from .odometry import GrowingSegment, Segment, odometry
-from .registration import register
+from .registration import register_view
 from .relocalise import find_join
 
 ROUNDS = ((0.08, 4), (0.03, 2), (0.015, 1))  # of the joint solution: reach of partners in m, every how many points
-PARTNERS_PER_FRAGMENT = 8
+PARTNERS_PER_FRAGMENT = 8  # overlaps kept of each, about
 MIN_OVERLAP = 0.2  # of a fragment's points
-FRAME_REACHES_M = (0.02, 0.015, 0.01)
-FRAME_TARGETS = 3
+FRAME_REACHES_M = (0.02, 0.015, 0.01)  # reach of partners, one iteration each
+FRAME_TARGETS = 3  # fragments, the nearest, that a frame is aligned with
 SPEED_FRAMES = 5  # over which the motion before a break is taken
 MIN_FLOOR_SHARE = 0.05  # of frames that must show a floor for it to count as found
 
@@ -277,7 +277,7 @@ def _refined(placed: list[_Placed]) -> list[Float]:
             turn = np.arccos(np.clip(centres[:, :3, 2] @ T[:3, 2], -1, 1))
             near = np.argsort(turn + np.linalg.norm(centres[:, :3, 3] - T[:3, 3], axis=1), kind="stable")
             targets = [(fragments[k][0].map, fragments[k][1]) for k in near[:FRAME_TARGETS]]
-            aligned, partners = register(p.segment.samples[n], targets, T, FRAME_REACHES_M, stride=2)
+            aligned, partners = register_view(p.segment.samples[n], targets, T, FRAME_REACHES_M, stride=2)
             if partners is not None and np.linalg.norm(aligned[:3, 3] - T[:3, 3]) < FRAME_REACHES_M[0]:
                 poses[n] = aligned
         out.append(poses)

@@ -16,9 +16,9 @@ from ...errors import ScanError
 from ...files.reading import decode_image, read_text
 from ...files.tum import poses_to_trajectory
 from ...types import Float, Scan
-from ..common import frame_times, image_size, image_stream, make_camera, make_rig, numbered
+from ..common import ImageFiles, frame_times, image_size, image_stream, make_camera, make_rig, numbered
 
-UNIT_M = 1e-4
+UNIT_M = 1e-4  # the recorder's unit of depth, 0.1 mm
 # Found by predicting registered from raw depth (tests/test_scans.py): without the extrinsic's 4.3 mm along z the two
 # agree to 0.6 mm, with it to 4.1 mm.
 NOT_MOVED = "registered depth was moved to colour's pixels but keeps the depth camera's z: 4.3 mm less than colour's"
@@ -55,17 +55,13 @@ def read_shelf(path: Path, *, registered: bool) -> Scan:
         format="apc-shelf",
         rig=make_rig(depth_camera, color_camera, T_color_depth, place=path / "cam.info.txt"),
         depth=image_stream(
-            "depth",
-            [f for _, f in depth],
-            frame_times(numbers),
+            ImageFiles("depth", [f for _, f in depth], frame_times(numbers), path, numbers),
             depth_camera,
-            place=path,
             unit_m=UNIT_M,
             decode=decode_depth,
-            index=numbers,
         ),
         color=image_stream(
-            "color", [f for _, f in color], frame_times(color_numbers), color_camera, place=path, index=color_numbers
+            ImageFiles("color", [f for _, f in color], frame_times(color_numbers), path, color_numbers), color_camera
         ),
         trajectory=poses_to_trajectory(frame_times(numbers), T_world_color @ T_color_depth, place=path),
         depth_unit_m=UNIT_M,
@@ -77,7 +73,7 @@ def read_shelf(path: Path, *, registered: bool) -> Scan:
 
 
 def decode_depth(data: bytes, place: object) -> NDArray[np.uint16]:
-    """A shelf PNG's values, rotated back: 0.1 mm, 0 = none."""
+    """A shelf PNG's values (H, W), rotated back: numbers of 0.1 mm, 0 = none."""
     v = decode_image(data, shape=None, kind="depth", place=place)
     if v.dtype != np.uint16 or v.ndim != 2:
         raise ScanError(f"depth is {v.dtype} with {v.ndim} axes, expected 16-bit grey", place=place)

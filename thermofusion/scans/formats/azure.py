@@ -68,10 +68,10 @@ def read(path: Path) -> Scan:
         color_track = None
 
     calibration = _calibration(recording, path)
-    depth_camera, T_depth = camera_of(calibration, "depth", depth_track.width_px, depth_track.height_px, path)
+    depth_camera, T_depth = azure_camera(calibration, "depth", depth_track.width_px, depth_track.height_px, path)
     color_camera, T_color_depth = None, None
     if color_track is not None:
-        color_camera, T_color = camera_of(calibration, "color", color_track.width_px, color_track.height_px, path)
+        color_camera, T_color = azure_camera(calibration, "color", color_track.width_px, color_track.height_px, path)
         T_color_depth = T_color @ invert(T_depth)
     shape = depth_camera.shape
     depth, lost = _stream(data, recording, depth_track, "depth", path, lambda b, p: decode_b16g(b, shape, p))
@@ -97,15 +97,15 @@ def read(path: Path) -> Scan:
 
 
 def decode_b16g(data: bytes, shape: tuple[int, int], place: object) -> NDArray[np.uint16]:
-    """Big-endian 16-bit grey without header."""
+    """Big-endian 16-bit grey (H, W) without header. Raises ScanError for another length."""
     h, w = shape
     if len(data) != 2 * h * w:
         raise ScanError(f"a frame has {len(data)} bytes, expected {2 * h * w} of {w} x {h} b16g", place=place)
     return np.frombuffer(data, ">u2").reshape(h, w).astype(np.uint16)
 
 
-def camera_of(calibration: Any, which: str, width_px: int, height_px: int, place: object) -> tuple[Camera, Float]:
-    """A camera for images of that size, and its pose T_camera_reference (metres), from the device's calibration.
+def azure_camera(calibration: Any, which: str, width_px: int, height_px: int, place: object) -> tuple[Camera, Float]:
+    """A camera for images of that size, and its pose T_camera_reference (4, 4) m, from the device's calibration.
 
     Intrinsics are stored in units of the whole image with the origin at the first pixel's *corner*. Distortion order
     there: k1..k6, codx, cody, p2, p1 (Brown-Conrady rational model, as OpenCV's).

@@ -12,17 +12,20 @@ from dataclasses import dataclass, field
 
 from ...errors import ScanError
 
+# Element identifiers of the Matroska specification (RFC 9559)
 SEGMENT, CLUSTER, TRACKS = 0x18538067, 0x1F43B675, 0x1654AE6B
 ATTACHMENTS, TAGS, INFO = 0x1941A469, 0x1254C367, 0x1549A966
+# identifier of the EBML header (RFC 8794)
 _HEADER = 0x1A45DFA3
 _TRACK_ENTRY, _NUMBER, _NAME, _CODEC, _PRIVATE, _VIDEO, _WIDTH, _HEIGHT, _COLOUR_SPACE, _ENCODINGS = (
     0xAE, 0xD7, 0x536E, 0x86, 0x63A2, 0xE0, 0xB0, 0xBA, 0x2EB524, 0x6D80,
 )  # fmt: skip
+# of attachments, tags, clusters (RFC 9559)
 _FILE, _FILE_NAME, _FILE_DATA = 0x61A7, 0x466E, 0x465C
 _TAG, _SIMPLE_TAG, _TAG_NAME, _TAG_STRING = 0x7373, 0x67C8, 0x45A3, 0x4487
 _TIMESCALE, _CLUSTER_TIME, _SIMPLE_BLOCK, _BLOCK_GROUP, _BLOCK = 0x2AD7B1, 0xE7, 0xA3, 0xA0, 0xA1
 _TOP = {SEGMENT, CLUSTER, TRACKS, ATTACHMENTS, TAGS, INFO, 0x1C53BB6B, 0x114D9B74, 0x1043A770}
-MAX_FRAMES = 4_000_000
+MAX_FRAMES = 4_000_000  # a day at 30 a second is 2.6 million: more is a damaged or hostile file
 
 Buffer = bytes | memoryview
 
@@ -40,7 +43,7 @@ class Track:
 
 
 @dataclass(frozen=True)
-class Frame:
+class FrameBytes:
     """Where a frame's bytes lie in the file, and its time."""
 
     track: int
@@ -56,7 +59,7 @@ class Matroska:
     tracks: dict[int, Track] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
     tags: dict[str, str] = field(default_factory=dict)
-    frames: list[Frame] = field(default_factory=list)
+    frames: list[FrameBytes] = field(default_factory=list)
     timescale_ns: int = 1_000_000
     complete: bool = True
 
@@ -219,7 +222,7 @@ def _cluster(data: memoryview, start: int, end: int, out: Matroska, place: objec
             raise ScanError(f"more than {MAX_FRAMES} frames", place=place)
 
 
-def _block(data: memoryview, s: int, e: int, cluster_time: int, scale_ns: int, place: object) -> Frame:
+def _block(data: memoryview, s: int, e: int, cluster_time: int, scale_ns: int, place: object) -> FrameBytes:
     """Track, signed 16-bit time relative to the cluster, flags; lacing is not used by recorders of images."""
     track, at = _vint(data, s, e, keep_marker=False)
     if track is None or at + 3 > e:
@@ -227,4 +230,4 @@ def _block(data: memoryview, s: int, e: int, cluster_time: int, scale_ns: int, p
     relative = int.from_bytes(data[at : at + 2], "big", signed=True)
     if data[at + 2] & 0x06:
         raise ScanError("laced blocks are not supported", place=place)
-    return Frame(track, (cluster_time + relative) * scale_ns, at + 3, e - at - 3)
+    return FrameBytes(track, (cluster_time + relative) * scale_ns, at + 3, e - at - 3)

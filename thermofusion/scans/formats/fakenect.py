@@ -21,12 +21,12 @@ from ...files.pnm import read_pnm
 from ...files.reading import inside, read_bytes, read_text
 from ...geometry.rigid import pose
 from ...types import Float, Scan
-from ..common import image_stream, make_camera, make_rig
+from ..common import ImageFiles, image_stream, make_camera, make_rig
 
-TICK_HZ = 60e6
-TICK_WRAP = 2**32
-NO_DEPTH_RAW = 2047
-COUNTS_PER_G = 819.0
+TICK_HZ = 60e6  # of the Kinect's clock
+TICK_WRAP = 2**32  # ticks: the counter has 32 bits, 72 s
+NO_DEPTH_RAW = 2047  # 11 bits, all set
+COUNTS_PER_G = 819.0  # of the accelerometer, libfreenect's constant
 _NAME = re.compile(r"^([dra])-(\d+(?:\.\d+)?)-(\d{1,10})\.(pgm|ppm|dump)$")
 
 
@@ -95,20 +95,16 @@ def read(path: Path, constants: KinectDepth = KinectDepth()) -> Scan:
     table = constants.table_mm()
     depth_rows = _in_time(rows["d"], times)
     depth = image_stream(
-        "depth",
-        [entries[i].file for i in depth_rows],
-        times[depth_rows],
+        ImageFiles("depth", [entries[i].file for i in depth_rows], times[depth_rows], path / "INDEX.txt"),
         depth_camera,
-        place=path / "INDEX.txt",
         decode=lambda data, place: decode_depth(data, place, table),
     )
     color, color_camera = None, None
     if rows["r"]:
         color_rows = _in_time(rows["r"], times)
         color_camera = make_camera(640, 480, np.array([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]]), place=path)
-        color = image_stream(
-            "color", [entries[i].file for i in color_rows], times[color_rows], color_camera, place=path / "INDEX.txt"
-        )
+        pictures = [entries[i].file for i in color_rows]
+        color = image_stream(ImageFiles("color", pictures, times[color_rows], path / "INDEX.txt"), color_camera)
     T_color_depth = pose(np.eye(3), np.array([-0.025, 0.0, 0.0]))
     dropped = len(rows["d"]) - len(depth_rows)
     return Scan(

@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 from ...errors import ScanError
 from ...geometry.rigid import pose
 from ...types import Camera, Float, Scan, SignalCurve, Stream, ThermalCamera, ThermalStream, Trajectory
-from ..common import as_thermal, frame_times, image_stream, make_camera, make_rig, numbered
+from ..common import ImageFiles, as_thermal, frame_times, image_stream, make_camera, make_rig, numbered
 
-THERMAL_SHAPE = (476, 632)
+THERMAL_SHAPE = (476, 632)  # (height, width), px: files have no header
 FAR_CLIP_MM = 3975  # the recorder's far clip: no measurement
 DEPTH_FOCAL_PX = 580.0  # nominal for a Kinect v1's depth camera; board planes say 576 ± 2
 # The face was recorded with the rig as it stood on another day. Fitted to that picture's own outline (shoulders and
@@ -82,7 +82,7 @@ def read(path: Path, *, depth_to_color_x_m: float = -0.025) -> Scan:
         format="jhu",
         rig=make_rig(depth_camera, color_camera, None if face else T_color_depth, place=path),
         depth=image_stream(
-            "depth", depth_files, times, depth_camera, place=path, index=numbers, invalid=(0, FAR_CLIP_MM)
+            ImageFiles("depth", depth_files, times, path, numbers), depth_camera, invalid=(0, FAR_CLIP_MM)
         ),
         color=None if color_camera is None else _color(depth_files, times, numbers, color_camera, path),
         thermal=_thermal(depth_files, times, numbers, T_color_depth, path),
@@ -101,7 +101,7 @@ def _color(depth_files: list[Path], times_s: Float, numbers: list[int], camera: 
     """The pictures beside the depth frames, where there are some."""
     rows = [i for i, f in enumerate(depth_files) if f.with_suffix(".jpg").is_file()]
     files, index = [depth_files[i].with_suffix(".jpg") for i in rows], [numbers[i] for i in rows]
-    return image_stream("color", files, times_s[rows], camera, place=path, index=index)
+    return image_stream(ImageFiles("color", files, times_s[rows], path, index), camera)
 
 
 def _thermal(
@@ -118,12 +118,12 @@ def _thermal(
         0.0315,
     )
     files = [f.with_name(f"{f.stem}_0000.raw") for f in depth_files]
-    stream = image_stream("thermal", files, times_s, camera.lens, place=path, index=numbers, decode=decode_counts)
+    stream = image_stream(ImageFiles("thermal", files, times_s, path, numbers), camera.lens, decode=decode_counts)
     return as_thermal(stream, camera)
 
 
 def decode_counts(data: bytes, place: object) -> NDArray[np.uint16]:
-    """A headerless frame of big-endian counts."""
+    """A headerless frame (H, W) of big-endian counts. Raises ScanError for another length."""
     h, w = THERMAL_SHAPE
     if len(data) != 2 * h * w:
         raise ScanError(f"expected {2 * h * w} bytes of {w} x {h} counts, got {len(data)}", place=place)

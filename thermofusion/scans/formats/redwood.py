@@ -18,6 +18,7 @@ from ...files.tum import poses_to_trajectory
 from ...types import Camera, Float, Scan, Trajectory
 from ..common import (
     NOMINAL_K,
+    ImageFiles,
     frame_times,
     image_size,
     image_stream,
@@ -52,13 +53,13 @@ def read(path: Path) -> Scan:
     log = next((path / n for n in ("trajectory.log", "odometry.log") if (path / n).is_file()), None)
     color = None
     if color_paths:
-        color = image_stream("color", color_paths, color_times, camera, place=path, index=color_index)
+        color = image_stream(ImageFiles("color", color_paths, color_times, path, color_index), camera)
     return Scan(
         name=path.resolve().name,
         root=path,
         format="redwood",
         rig=make_rig(camera, camera if color is not None else None, place=path),
-        depth=image_stream("depth", depth_paths, depth_times, camera, place=path, index=depth_index),
+        depth=image_stream(ImageFiles("depth", depth_paths, depth_times, path, depth_index), camera),
         color=color,
         trajectory=None if log is None else _trajectory(log, depth_times),
         notes=tuple(notes),

@@ -15,9 +15,9 @@ from ...files.reading import read_numbers
 from ...files.tum import poses_to_trajectory
 from ...geometry.rigid import pose
 from ...types import Scan, Trajectory
-from ..common import frame_times, image_size, image_stream, make_camera, make_rig, numbered
+from ..common import ImageFiles, frame_times, image_size, image_stream, make_camera, make_rig, numbered
 
-INVALID = (0, 65535)
+INVALID = (0, 65535)  # raw depths that mean none
 PUBLISHED_K = np.array([[585.0, 0, 320], [0, 585.0, 240], [0, 0, 1]])
 # The Kinect v1's colour camera is not calibrated in this data set: OpenNI's focal length and the mechanical baseline.
 COLOR_K = np.array([[525.0, 0, 320], [0, 525.0, 240], [0, 0, 1]])
@@ -45,13 +45,9 @@ def read(path: Path) -> Scan:
     if color_frames:
         color_camera = make_camera(*image_size(color_frames[0][1], "color"), COLOR_K, place=path)
         color_numbers = [n for n, _ in color_frames]
+        pictures = [f for _, f in color_frames]
         color = image_stream(
-            "color",
-            [f for _, f in color_frames],
-            frame_times(color_numbers),
-            color_camera,
-            place=path,
-            index=color_numbers,
+            ImageFiles("color", pictures, frame_times(color_numbers), path, color_numbers), color_camera
         )
         notes.append("colour is not calibrated here: nominal Kinect colour camera, 25 mm beside depth, assumed")
     trajectory, lost = _poses(path, numbers)
@@ -62,7 +58,7 @@ def read(path: Path) -> Scan:
         root=path,
         format="7-scenes",
         rig=make_rig(camera, color_camera, T_COLOR_DEPTH if color_camera is not None else None, place=path),
-        depth=image_stream("depth", files, frame_times(numbers), camera, place=path, index=numbers, invalid=INVALID),
+        depth=image_stream(ImageFiles("depth", files, frame_times(numbers), path, numbers), camera, invalid=INVALID),
         color=color,
         trajectory=trajectory,
         notes=tuple(notes),

@@ -14,9 +14,9 @@ from ...errors import ScanError
 from ...files.reading import inside, read_text
 from ...files.tum import read_trajectory
 from ...types import Camera, Scan, Stream
-from ..common import NOMINAL_K, Kind, image_size, image_stream, make_camera, make_rig
+from ..common import NOMINAL_K, ImageFiles, Kind, image_size, image_stream, make_camera, make_rig
 
-UNITS_PER_METRE = 5000
+UNITS_PER_METRE = 5000  # of the benchmark's depth images
 # fx fy cx cy of the benchmark's three sensors, as its authors published them.
 PUBLISHED = {
     "freiburg1": (517.3, 516.5, 318.6, 255.3),
@@ -55,7 +55,7 @@ def read(path: Path) -> Scan:
         root=path,
         format="tum",
         rig=make_rig(camera, camera, place=path),
-        depth=image_stream("depth", files, times, camera, place=path / "depth.txt", unit_m=unit_m),
+        depth=image_stream(ImageFiles("depth", files, times, path / "depth.txt"), camera, unit_m=unit_m),
         color=_stream(path, "rgb.txt", "color", camera),
         trajectory=read_trajectory(truth) if truth.is_file() else None,
         depth_unit_m=unit_m,
@@ -65,7 +65,7 @@ def read(path: Path) -> Scan:
 
 def _stream(path: Path, name: str, kind: Kind, camera: Camera) -> Stream:
     times, files = _list(path, name)
-    return image_stream(kind, files, times, camera, place=path / name)
+    return image_stream(ImageFiles(kind, files, times, path / name), camera)
 
 
 def _list(root: Path, name: str) -> tuple[list[float], list[Path]]:

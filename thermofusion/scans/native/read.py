@@ -14,7 +14,7 @@ from ...files.reading import COPY_AGAIN, inside, read_json, read_text
 from ...files.strict import validated
 from ...files.tum import read_trajectory
 from ...types import Camera, Environment, Scan, Stream
-from ..common import as_thermal, image_stream
+from ..common import ImageFiles, as_thermal, image_stream
 from .schema import SCHEMA, STREAMS, ScanDoc, reference_of, rig_of, thermal_camera_of, unknown_keys
 
 __all__ = ["SCHEMA", "STREAMS", "is_native", "read_native"]
@@ -97,16 +97,15 @@ def _read_frames(root: Path, cameras: Mapping[str, Camera | None], unit_m: float
         if camera is None:
             raise ScanError(f"{kind} frames are listed, but scan.json has no 'cameras.{kind}'", place=path)
         _check_files(own, path)
-        streams[kind] = image_stream(
+        files = ImageFiles(
             kind,
             [r.file for r in own],
             [r.time_s for r in own],
-            camera,
-            place=path,
-            unit_m=unit_m,
-            index=[r.index for r in own],
-            usable=[r.usable for r in own],
+            path,
+            [r.index for r in own],
+            [r.usable for r in own],
         )
+        streams[kind] = image_stream(files, camera, unit_m=unit_m)
     return streams
 
 

@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from ...errors import ScanError
 from ...files.reading import MAX_PIXELS, claimed_size, read_bytes
+from ...physics.band import ZERO_DEGC_K
 from ...types import Scan, SignalCurve
 from ..native.compose import ThermalFrames
 
-_RAW, _CAMERA = 0x01, 0x20
+_RAW, _CAMERA = 0x01, 0x20  # types of FFF records: raw image, camera's parameters
 _MAGIC = b"FFF\0"
-ZERO_DEGC_K = 273.15
 
 
 @dataclass(frozen=True)
@@ -50,12 +50,12 @@ class FlirParameters:
     X: float = 1.9
 
     def signal(self, degC: float | NDArray) -> NDArray:
-        """Raw signal of a blackbody at a temperature: R1 / (R2 (exp(B/T) - F)) - O."""
+        """Raw signal (counts) of a blackbody at a temperature, any shape: R1 / (R2 (exp(B/T) - F)) - O."""
         T = np.asarray(degC, np.float64) + ZERO_DEGC_K
         return self.R1 / (self.R2 * (np.exp(self.B / T) - self.F)) - self.O
 
     def apparent_degC(self, signal: NDArray) -> NDArray:
-        """Inverse of `signal`; NaN where there is no such temperature."""
+        """Inverse of `signal`: counts of any shape to °C; NaN where there is no such temperature."""
         with np.errstate(divide="ignore", invalid="ignore"):
             T = self.B / np.log(self.R1 / (self.R2 * (np.asarray(signal, np.float64) + self.O)) + self.F)
             return np.where(np.isfinite(T) & (T > 0), T - ZERO_DEGC_K, np.nan)
@@ -70,7 +70,7 @@ class FlirParameters:
         return float(self.X * a + (1 - self.X) * b)
 
     def temperature_degC(self, raw: NDArray) -> NDArray[np.float32]:
-        """Object temperature by the file's own emissivity, reflection, air and window."""
+        """Object temperature of raw counts, any shape, by the file's own emissivity, reflection, air and window."""
         tau, window = self.air_transmission(), self.window_transmission
         air = self.signal(self.air_degC)
         s = np.asarray(raw, np.float64)
