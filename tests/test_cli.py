@@ -86,16 +86,16 @@ def test_nothing_is_computed_twice_and_the_plan_says_why(demo, capsys):
     code, text, _ = call(capsys, "run", scan, "-r", "torso", "-o", out, "--dry-run", "--json")
     assert code == 0
     assert all(p["reuse"] for p in json.loads(text))
-    changed = ("--set", "radiometry.reflected_degC=21")
+    changed = ("--set", "temperature.reflected_degC=21")
     code, text, _ = call(capsys, "run", scan, "-r", "torso", "-o", out, "--dry-run", "--json", *changed)
     plan = {p["name"]: p for p in json.loads(text)}
-    assert plan["track"]["reuse"]
+    assert plan["tracking"]["reuse"]
     assert plan["surface"]["reuse"]
     assert not plan["temperature"]["reuse"]
     again = (out / "mesh.ply").read_bytes()
     code, text, _ = call(capsys, "run", scan, "-r", "torso", "-o", out, "--json")
     assert code == 0
-    assert json.loads(text)["stages_reused"] == ["track", "surface", "align", "observe", "temperature"]
+    assert json.loads(text)["stages_reused"] == ["tracking", "surface", "rig", "mapping", "temperature"]
     assert (out / "mesh.ply").read_bytes() == again
 
 
@@ -117,7 +117,7 @@ def test_export_writes_other_formats_palettes_and_modes(demo, tmp_path, capsys):
         (["run"], 2, ["Missing argument"]),
         (["run", "nowhere"], 3, ["nowhere", "no such scan"]),
         (["run", "DEMO", "-r", "tors"], 2, ["did you mean 'torso'"]),
-        (["run", "DEMO", "--set", "fusion.voxelmm=3"], 2, ["fusion.voxelmm", "voxel_mm"]),
+        (["run", "DEMO", "--set", "surface.voxelmm=3"], 2, ["surface.voxelmm", "voxel_mm"]),
         (["run", "DEMO", "--until", "fuse"], 2, ["no stage 'fuse'", "surface"]),
         (["run", "DEMO", "--format", "tmu"], 2, ["tmu", "tum"]),
         (["export", "nowhere"], 3, ["no finished result"]),
