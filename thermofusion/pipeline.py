@@ -16,17 +16,17 @@ from typing import TYPE_CHECKING, Any
 from .errors import RecipeError
 from .progress import Progress, silent
 from .recipe import RENAMED_STAGES, Recipe
-from .report.summary import Steps, result_report, summary
-from .results.folder import Result, load_mesh, write_result
-from .results.stages import Computes, Stage, StagePlan, Stages, fingerprint
+from .report.summary import Steps, summary
+from .results.claim import claimed
+from .results.folder import Result, add_files, load_mesh, names_of, write_result
+from .results.frame import frame_of
+from .results.stages import Computes, Stage, StagePlan, Stages, fingerprint, run_id
 from .scans.check import verify
-from .types import Scan, SurfaceMesh
+from .types import Scan
 from .version import __version__
 
 if TYPE_CHECKING:
     from .report.casts import Cast
-    from .surface.surface import SurfaceResult
-    from .tracking.track import TrackingResult
 
 # A stage is handed exactly the recipe sections that its key holds. It also depends on all stages before it.
 STAGES = (
@@ -47,68 +47,114 @@ def fuse(
     progress: Progress = silent,
     redo_from: str | None = None,
     until: str | None = None,
-    compare_methods: bool = False,
+    overwrite: bool = False,
 ) -> Result:
     """Fuse a scan into a mesh whose every vertex carries a temperature and its uncertainty.
 
     Parameters
     ----------
     out : result folder; stages stored there are reused where their inputs are unchanged. None: nothing is written.
-    progress : called with (stage, done, total).
-    redo_from, until : names of stages. compare_methods : also compute every other method, for the report.
+    progress : called with (stage, done, total). redo_from, until : names of stages. overwrite : replace another scan's
+    result, or a file of another origin, in `out`.
 
     Raises ScanError (unusable input), RecipeError, ResourceError. What was computed before an error stays in `out`.
     """
-    from .mapping.observe import observe
-    from .rig.align import align
-    from .surface.surface import fuse_surface
-    from .temperature.solve import solve, unmeasured
-    from .tracking.track import locate
-
     verify(scan)
-    folder = None if out is None else Path(out)
-    first_anew, last = _position(redo_from, len(STAGES)), _position(until, len(STAGES) - 1)
-    stages = _stages(scan, recipe, folder)
-    stages.tidy()
-
-    def step(number: int, compute: Computes) -> Any:
-        if number > last:
-            return None
-        name = STAGES[number].name
-        progress(name, 0, 1)
-        value = stages.run(STAGES[number], compute, progress, anew=number >= first_anew)
-        progress(name, 1, 1)
-        return value
-
-    # 1. Surface
-    tracking = step(0, partial(locate, scan))
-    surface = step(1, partial(fuse_surface, scan, tracking))
-    rig = mapped = temperature = casts = None
-    if surface is not None:
-        facts = {"recipe": recipe.name, **_axes(scan, tracking, surface)}
-        if scan.thermal is None:
-            temperature = unmeasured(surface.mesh, recipe.temperature, facts)
-        else:
-            # 2. Rig
-            rig = step(2, partial(align, scan, surface.mesh, tracking.trajectory))
-            # 3. Mapping
-            mapped = step(3, partial(observe, scan, surface.mesh, tracking.trajectory, rig))
-            # 4. Temperature, while the pictures' rays are cast on the other core
-            if folder is not None and until is None and recipe.output.views:
-                casts = _casting(surface.mesh, facts)
-            temperature = step(4, partial(solve, scan, surface, mapped, metadata=facts, compare=compare_methods))
-
-    steps = Steps(tracking, surface, rig, mapped, temperature)
-    result = Result(**vars(steps), report=result_report(scan, recipe, steps, stages.reused))
-    if folder is not None:
-        write_result(result, recipe, folder, casts)
-    return result
+    run = _Run(scan, recipe, None if out is None else Path(out), progress, redo_from, until)
+    if run.folder is None:
+        return run.result()
+    with claimed(run.folder, scan, names_of(recipe), overwrite=overwrite) as left:
+        result = run.result()
+        write_result(result, recipe, run.folder, left, run.casts)
+        return result
 
 
 def plan(scan: Scan, recipe: Recipe, out: Path, *, redo_from: str | None = None) -> list[StagePlan]:
     """What `fuse` would compute or reuse, and why; nothing is computed."""
-    stages, first = _stages(scan, recipe, out), _position(redo_from, len(STAGES))
-    return [stages.plan(stage, anew=number >= first) for number, stage in enumerate(STAGES)]
+    run = _Run(scan, recipe, out, redo_from=redo_from)
+    return [run.stages.plan(stage, anew=number >= run.first_anew) for number, stage in enumerate(STAGES)]
+
+
+class _Run:
+    """One way from a recording to a result."""
+
+    def __init__(
+        self,
+        scan: Scan,
+        recipe: Recipe,
+        folder: Path | None,
+        progress: Progress = silent,
+        redo_from: str | None = None,
+        until: str | None = None,
+    ) -> None:
+        self.scan, self.recipe, self.folder, self.progress = scan, recipe, folder, progress
+        self.first_anew, self.last = _position(redo_from, len(STAGES)), _position(until, len(STAGES) - 1)
+        self.stages = Stages(folder, {"thermofusion": __version__, "scan": fingerprint(scan)}, recipe)
+        self.casts: Future[list[Cast]] | None = None
+
+    def result(self) -> Result:
+        """All steps, each reused or computed."""
+        self.stages.tidy()
+        steps, output = self.steps(), self.recipe.output
+        run = run_id(self.stages.key, output.model_dump(mode="json"))
+        result = Result.of(self.scan, self.recipe, steps, self.stages.reused, run)
+        if output.compare_methods and steps.surface and steps.mapped and steps.temperature:
+            from .temperature.solve import compare_methods
+
+            mesh, window_m = steps.surface.mesh, steps.surface.normal_window_m
+            sections = self.recipe.mapping, self.recipe.temperature
+            methods = compare_methods(self.scan, mesh, window_m, steps.mapped, steps.temperature, sections)
+            result.report["temperature"]["methods"] = methods
+        return result
+
+    def steps(self) -> Steps:
+        """The method: the paper's four steps."""
+        from .mapping.observe import observe
+        from .rig.align import align
+        from .surface.surface import fuse_surface
+        from .temperature.solve import solve, unmeasured
+        from .tracking.track import locate
+
+        scan, step = self.scan, self.step
+        # 1. Surface
+        tracking = step("tracking", partial(locate, scan))
+        surface = step("surface", partial(fuse_surface, scan, tracking))
+        if surface is None:
+            return Steps(tracking)
+        mesh, trajectory, window_m = surface.mesh, tracking.trajectory, surface.normal_window_m
+        if scan.thermal is None:
+            return Steps(tracking, surface, temperature=unmeasured(mesh, self.recipe.temperature))
+        # 2. Rig
+        rig = step("rig", partial(align, scan, mesh, trajectory))
+        # 3. Mapping
+        mapped = step("mapping", partial(observe, scan, mesh, trajectory, rig))
+        # 4. Temperature, while the pictures' rays are cast on the other core
+        self.cast(Steps(tracking, surface))
+        temperature = step("temperature", partial(solve, scan, mesh, mapped, normal_window_m=window_m))
+        return Steps(tracking, surface, rig, mapped, temperature)
+
+    def step(self, name: str, compute: Computes) -> Any:
+        """A stage's result, stored or computed; None behind the last one asked for."""
+        number = STAGE_NAMES.index(name)
+        if number > self.last:
+            return None
+        self.progress(name, 0, 1)
+        value = self.stages.run(STAGES[number], compute, self.progress, anew=number >= self.first_anew)
+        self.progress(name, 1, 1)
+        return value
+
+    def cast(self, steps: Steps) -> None:
+        """Begin with the pictures, if there will be some."""
+        from .export import axes_of
+        from .report.pictures import cast_surface
+
+        if self.folder is None or self.last < len(STAGES) - 1 or not self.recipe.output.views:
+            return
+        assert steps.surface is not None
+        axes = axes_of(frame_of(self.scan, steps, self.recipe.output).axes)
+        pool = ThreadPoolExecutor(max_workers=1)
+        self.casts = pool.submit(cast_surface, steps.surface.mesh, axes)
+        pool.shutdown(wait=False)
 
 
 def _position(name: str | None, default: int) -> int:
@@ -121,27 +167,4 @@ def _position(name: str | None, default: int) -> int:
     return STAGE_NAMES.index(name)
 
 
-def _casting(surface: SurfaceMesh, facts: dict[str, str]) -> Future[list[Cast]]:
-    from .export import axes_of
-    from .report.pictures import cast_surface
-
-    pool = ThreadPoolExecutor(max_workers=1)
-    casts = pool.submit(cast_surface, surface, axes_of(facts))
-    pool.shutdown(wait=False)
-    return casts
-
-
-def _axes(scan: Scan, tracking: TrackingResult, surface: SurfaceResult) -> dict[str, str]:
-    from .export import view_axes
-
-    floor = surface.floor_plane if surface.floor_plane is not None else tracking.floor_plane
-    centre_m = surface.mesh.vertices_m.mean(0)
-    normal = None if floor is None else floor[:3]
-    return view_axes(tracking.trajectory.T_world_depth, centre_m, normal, scan.depth_up)
-
-
-def _stages(scan: Scan, recipe: Recipe, folder: Path | None) -> Stages:
-    return Stages(folder, {"thermofusion": __version__, "scan": fingerprint(scan)}, recipe)
-
-
-__all__ = ["STAGES", "STAGE_NAMES", "Result", "fuse", "load_mesh", "plan", "summary", "write_result"]
+__all__ = ["STAGES", "STAGE_NAMES", "Result", "add_files", "fuse", "load_mesh", "plan", "summary", "write_result"]

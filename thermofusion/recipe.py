@@ -203,8 +203,17 @@ class TemperatureSection(_Section):
 class OutputSection(_Section):
     """What is written."""
 
+    frame: Literal["upright", "world"] = Field(
+        "upright", description="upright: y up, z toward who looks at the front; world: the tracking's own frame"
+    )
+    front: Literal["auto", "front", "back", "left", "right"] = Field(
+        "auto",
+        description="side of the person that the first depth frame shows; auto: by the feet, else taken for the front",
+    )
+
     formats: list[Literal["ply", "glb", "vtp", "csv"]] = ["ply", "glb", "vtp"]
     views: bool = Field(True, description="views/*.png")
+    compare_methods: bool = Field(False, description="how every other method's temperatures differ, in result.json")
     palette: Literal["inferno", "iron", "grey", "cividis", "rainbow"] = "inferno"
     range_degC: tuple[float, float] | None = Field(
         None, strict=False, description="colour range, low and high; None = 1st to 99th percentile"

@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import NoReturn
 
 from ..errors import RecipeError
@@ -29,6 +30,13 @@ def emit(value: object, text: str, as_json: bool) -> None:
 def note(text: str) -> None:
     """A line for people, beside the result."""
     print(text, file=sys.stderr)
+
+
+def named(out: Path) -> Path:
+    """A folder or file given with -o. Raises RecipeError for an empty name."""
+    if not str(out).strip() or out == Path():
+        raise RecipeError("-o needs a name, got an empty one", hint="name a new folder")
+    return out
 
 
 def low_high(text: str | None, unit: str) -> tuple[float, float] | None:

@@ -8,37 +8,31 @@ from typing import Annotated
 import typer
 
 from .console import emit, note, progress
-
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
-Overrides = Annotated[list[str] | None, typer.Option("--set", help="section.key=value, over the recipe; repeatable")]
+from .options import Json, Processing, Recording, unfolded
 
 
 def register(app: typer.Typer) -> None:
     """Add this module's verbs."""
-    app.command()(validate)
+    app.command()(unfolded(validate))
     app.command()(compare)
 
 
 def validate(
-    scan: Annotated[Path, typer.Argument(help="A scan folder, or a foreign recording.")],
-    recipe: Annotated[str, typer.Option("-r", "--recipe", help="A shipped name or a TOML file.")] = "torso",
+    recording: Recording,
+    processing: Processing,
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="Result folder: what it holds is reused, the rest written.")
     ] = None,
-    set_: Overrides = None,
-    format: Annotated[str | None, typer.Option(help="Format of the recording; recognised by default.")] = None,
     folds: Annotated[int, typer.Option(min=2, help="Parts the views are cut into, each left out once.")] = 5,
     motion: Annotated[bool, typer.Option(help="Also try small corrections of single views.")] = True,
     json: Json = False,
 ) -> None:
     """Leave views out and predict them: error in K by viewing angle, and the map's own expected error."""
     from ..judge.validate import validate as judge
-    from ..recipe import load_recipe
-    from ..scans import open_scan
 
-    recording, chosen = open_scan(scan, format=format), load_recipe(recipe, set_ or ())
+    scan, recipe = recording.open(), processing.load()
     with progress(json) as step:
-        report = judge(recording, chosen, out=out, folds=folds, motion=motion, progress=step)
+        report = judge(scan, recipe, out=out, folds=folds, motion=motion, progress=step)
     emit(report, report.text(), json)
 
 

@@ -8,53 +8,40 @@ from typing import Annotated
 import typer
 
 from ..errors import QualityError
-from .console import emit, low_high, note, progress
+from .console import emit, low_high, named, note, progress
+from .options import Json, Processing, Recording, unfolded
 
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
-Overrides = Annotated[list[str] | None, typer.Option("--set", help="section.key=value, over the recipe; repeatable")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what stands in the result folder.")]
 
 
 def register(app: typer.Typer) -> None:
     """Add this module's verbs."""
-    app.command()(run)
+    app.command()(unfolded(run))
     app.command()(demo)
     app.command()(export)
 
 
 def run(
-    scan: Annotated[Path, typer.Argument(help="A scan folder, or a foreign recording.")],
-    recipe: Annotated[str, typer.Option("-r", "--recipe", help="A shipped name or a TOML file.")] = "torso",
+    recording: Recording,
+    processing: Processing,
     out: Annotated[Path, typer.Option("-o", "--out", help="Result folder.")] = Path("out"),
-    set_: Overrides = None,
-    format: Annotated[str | None, typer.Option(help="Format of the recording; recognised by default.")] = None,
-    method: Annotated[
-        str | None, typer.Option(help="joint, corrected-cos, cos-resolution, mean, nearest-view, paper; or `all`.")
-    ] = None,
     from_: Annotated[str | None, typer.Option("--from", help="Compute this stage and all later ones anew.")] = None,
     until: Annotated[str | None, typer.Option("--until", help="Stop after this stage.")] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be computed, and why.")] = False,
-    max_memory: Annotated[float | None, typer.Option("--max-memory", help="Bound on the voxel grid, GiB.")] = None,
+    overwrite: Overwrite = False,
     json: Json = False,
 ) -> int:
     """Fuse a recorded scan into a mesh with temperatures."""
     from .. import pipeline
-    from ..recipe import load_recipe
-    from ..scans import open_scan
 
-    overrides = list(set_ or ())
-    if max_memory is not None:
-        overrides.append(f"surface.max_memory_gib={max_memory}")
-    if method not in (None, "all"):
-        overrides.append(f"temperature.method={method}")
-    chosen = load_recipe(recipe, overrides, note=note)
-    recording = open_scan(scan, format=format)
+    chosen, scan = processing.load(), recording.open()
     if dry_run:
-        plans = pipeline.plan(recording, chosen, out, redo_from=from_)
+        plans = pipeline.plan(scan, chosen, out, redo_from=from_)
         emit(plans, "\n".join(f"{p.name:<12} {'reuse' if p.reuse else 'compute'}  ({p.why})" for p in plans), json)
         return 0
     with progress(json) as step:
         result = pipeline.fuse(
-            recording, chosen, out=out, progress=step, redo_from=from_, until=until, compare_methods=method == "all"
+            scan, chosen, out=named(out), progress=step, redo_from=from_, until=until, overwrite=overwrite
         )
     emit(result.report, pipeline.summary(result.report, out), json)
     return QualityError.exit_code if result.report["quality"]["failed"] else 0
@@ -62,6 +49,7 @@ def run(
 
 def demo(
     out: Annotated[Path, typer.Option("-o", "--out", help="Result folder.")] = Path("demo-result"),
+    overwrite: Overwrite = False,
     json: Json = False,
 ) -> int:
     """The shipped scan, end to end, then where to look."""
@@ -72,7 +60,7 @@ def demo(
 
     scan = open_scan(data_dir() / "demo")
     with progress(json) as step:
-        result = pipeline.fuse(scan, load_recipe("torso"), out=out, progress=step)
+        result = pipeline.fuse(scan, load_recipe("torso"), out=named(out), progress=step, overwrite=overwrite)
     emit(result.report, pipeline.summary(result.report, out), json)
     note(f"look at {out / 'views' / 'overview.png'}; open {out / 'mesh.glb'} in Blender, {out / 'mesh.ply'} in MeshLab")
     return QualityError.exit_code if result.report["quality"]["failed"] else 0
@@ -93,7 +81,10 @@ def export(
 
     limits = low_high(range_, "°C")
     mesh = pipeline.load_mesh(result, show)
-    written = write(
-        mesh, out or result, tuple(f.strip() for f in formats.split(",")), palette=palette, range_degC=limits
-    )
+    folder = result if out is None else named(out)
+    name = "mesh" if show == "absolute" else f"mesh-{show}"  # other modes never replace the corrected mesh
+    wanted = tuple(f.strip() for f in formats.split(","))
+    written = write(mesh, folder, wanted, palette=palette, range_degC=limits, name=name)
+    if folder.resolve() == result.resolve():
+        pipeline.add_files(result, written)
     emit({"written": written}, "\n".join(f"wrote {path}" for path in written), json)

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..errors import RecipeError, ResourceError, ScanError
 from ..files.tum import read_trajectory, write_trajectory
-from ..types import OutputMode, ThermalMesh, Trajectory
+from ..types import OutputMode, ThermalMesh
 from .axes import axes_of, view_axes
 from .csv import read_csv, write_csv
 from .glb import read_glb, write_glb
@@ -53,9 +53,9 @@ def export(
     *,
     palette: str = "inferno",
     range_degC: tuple[float, float] | None = None,
-    trajectory: Trajectory | None = None,
+    name: str = "mesh",
 ) -> list[Path]:
-    """Write `mesh.<format>` for each format, and `trajectory.txt`, into a folder that is made if need be.
+    """Write `<name>.<format>` for each format into a folder that is made if need be.
 
     Raises RecipeError for an unknown format, palette or range, ValueError for a broken mesh, ResourceError for the
     disk. Every file is whole or absent.
@@ -69,11 +69,9 @@ def export(
     except OSError as e:
         raise ResourceError(f"the folder cannot be made ({e.strerror})", place=folder) from None
     written = []
-    for name in wanted:
-        path = folder / f"mesh.{name}"
-        written.append(write_csv(path, mesh) if name == "csv" else _COLORED[name](path, mesh, palette, range_degC))
-    if trajectory is not None:
-        written.append(write_trajectory(folder / "trajectory.txt", trajectory))
+    for form in wanted:
+        path = folder / f"{name}.{form}"
+        written.append(write_csv(path, mesh) if form == "csv" else _COLORED[form](path, mesh, palette, range_degC))
     return written
 
 

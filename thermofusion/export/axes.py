@@ -42,7 +42,7 @@ def view_axes(
         up = axes[:, 0] if share[1] > MIN_TURN else own_up
     up = up * (1.0 if up @ own_up >= 0 else -1.0)
     R = axes_rotation(up, T_world_depth[0, :3, 3] - np.asarray(centre_m, np.float64))
-    return {"up": _text(R[1]), "front": _text(R[2])}
+    return {"up": axes_text(R[1]), "front": axes_text(R[2])}
 
 
 def axes_of(metadata: Mapping[str, str | float]) -> Float:
@@ -77,5 +77,6 @@ def _vector(text: object) -> Float | None:
     return v if v.shape == (3,) and np.isfinite(v).all() and np.linalg.norm(v) > 1e-9 else None
 
 
-def _text(v: Float) -> str:
-    return " ".join(f"{x:.9f}" for x in v + 0.0)
+def axes_text(v: Float) -> str:
+    """A direction (3,), unit, as metadata hold it."""
+    return " ".join(f"{x:.9f}" for x in np.round(v, 9) + 0.0)

@@ -40,10 +40,11 @@ def read_trajectory(path: Path) -> Trajectory:
     return poses_to_trajectory(rows[:, 0], T, place=path)
 
 
-def write_trajectory(path: str | Path, trajectory: Trajectory, *, exact: bool = False) -> Path:
+def write_trajectory(path: str | Path, trajectory: Trajectory, *, exact: bool = False, note: str = "") -> Path:
     """Write a trajectory; returns the path. Quaternions have qw >= 0.
 
-    exact : digits enough to read the same numbers back; else microseconds and nanometres. Raises ResourceError.
+    exact : digits enough to read the same numbers back; else microseconds and nanometres. note : a line of comment.
+    Raises ResourceError.
     """
     T = trajectory.T_world_depth
     q = Rotation.from_matrix(T[:, :3, :3]).as_quat(canonical=True)
@@ -52,7 +53,8 @@ def write_trajectory(path: str | Path, trajectory: Trajectory, *, exact: bool = 
         lines = [" ".join(map(repr, row)) for row in rows]
     else:
         lines = [f"{row[0]:.6f} " + " ".join(f"{x:.9f}" for x in row[1:]) for row in rows]
-    return write_whole(path, ["\n".join([HEAD, *lines, ""]).encode()])
+    told = [f"# {note}"] if note else []
+    return write_whole(path, ["\n".join([HEAD, *told, *lines, ""]).encode()])
 
 
 def poses_to_trajectory(times_s: NDArray, poses: NDArray, *, place: object) -> Trajectory:

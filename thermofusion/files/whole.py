@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -13,6 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ResourceError
+
+# Names of temporary files, should a run be killed: `.NAME.PROCESS.RANDOM.part`, and the name's suffix again.
+LEFTOVER = re.compile(r"\..*\.\d+\.[0-9a-f]{8}\.part(\.\w+)?")
 
 
 @contextmanager
@@ -25,7 +29,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     with _refusals(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name[:100]}.{os.getpid()}.{os.urandom(4).hex()}.part{path.suffix}")
+        temporary = _temporary(path)
         try:
             os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
             yield temporary
@@ -53,6 +57,37 @@ def write_whole(path: str | Path, chunks: Iterable[bytes | NDArray]) -> Path:
 def write_text(path: str | Path, text: str) -> Path:
     """Write a text file in UTF-8; returns the path. Raises ResourceError."""
     return write_whole(path, [text.encode()])
+
+
+def probe(folder: Path) -> None:
+    """Make a folder, and a file in it for a moment. Raises ResourceError where the folder or the disk refuses."""
+    with _refusals(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        temporary = _temporary(folder / "probe")
+        temporary.write_bytes(b"probe")
+        temporary.unlink()
+
+
+@contextmanager
+def changing_over(folder: Path, last: str) -> Iterator[Path]:
+    """A temporary folder whose files replace those of `folder` one after the other when the block ends well.
+
+    last : the file that comes last, and goes first: while it is there, all files are of one kind. Nothing of `folder`
+    is touched where the block fails. Raises ResourceError.
+    """
+    with _refusals(folder):
+        new = _temporary(folder / "new")
+        new.mkdir()
+        try:
+            yield new
+            names = sorted(p.relative_to(new) for p in new.rglob("*") if p.is_file() and p.name != last)
+            (folder / last).unlink(missing_ok=True)
+            for name in (*names, Path(last)):
+                (folder / name).parent.mkdir(exist_ok=True)
+                (new / name).replace(folder / name)
+            _to_disk(folder)
+        finally:
+            shutil.rmtree(new, ignore_errors=True)
 
 
 @contextmanager
@@ -84,6 +119,10 @@ def _refusals(path: Path) -> Iterator[None]:
     except OSError as e:
         place = path if e.filename is None or Path(e.filename).name.startswith(".") else e.filename
         raise ResourceError(f"it cannot be written ({e.strerror})", place=place, hint="free some space") from None
+
+
+def _temporary(path: Path) -> Path:
+    return path.with_name(f".{path.name[:100]}.{os.getpid()}.{os.urandom(4).hex()}.part{path.suffix}")
 
 
 def _to_disk(path: Path) -> None:

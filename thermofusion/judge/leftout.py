@@ -60,8 +60,9 @@ class Bench:
         views = len(np.unique(rows.view))
         if views < 3:
             raise ScanError(f"{views} thermal views see the surface: too few to leave any out", place=scan.root)
-        mesh, window_m = surface.mesh, surface.normal_window_m
-        problem = ThermalProblem.of(scan, mesh, window_m, mapped, recipe.mapping, recipe.temperature)
+        mesh = surface.mesh
+        sections = recipe.mapping, recipe.temperature
+        problem = ThermalProblem.of(scan, mesh, surface.normal_window_m, mapped, *sections)
         skin_K = temperature.absolute_degC.astype(np.float64) + ZERO_DEGC_K
         well_seen = np.bincount(rows.vertex[rows.cos_angle > WELL_SEEN_COS], minlength=len(mesh)) >= 2
         return cls(problem.informed(mesh, skin_K), well_seen)

@@ -41,6 +41,11 @@ def _by_method(scan: Scan, recipe: Recipe, result: Result, method: str) -> Therm
     assert result.surface is not None
     assert result.mapped is not None
     if method == recipe.temperature.method:
-        return result.mesh
+        return result.mesh_in_world
     other = recipe.temperature.model_copy(update={"method": method})
-    return solve(scan, result.surface, result.mapped, mapping=recipe.mapping, temperature=other).mesh
+    surface = result.surface
+    window_m = surface.normal_window_m
+    found = solve(
+        scan, surface.mesh, result.mapped, normal_window_m=window_m, mapping=recipe.mapping, temperature=other
+    )
+    return found.mesh

@@ -57,7 +57,7 @@ STRAIGHT_DEG = 35.0  # what counts as facing in the pictures; the numbers take s
 def cylinder_scan(prepared: Prepared) -> list[Figure]:
     """The phantom cylinder as a 3D scan, through the whole way from depth and thermal frames to temperatures."""
     case, scene = prepared.cylinder, cylinder_scene()
-    mesh = case.result.mesh
+    mesh = case.result.mesh_in_world
     c = compared(case.result, case.scan, case.recipe, CYLINDER | {"cosine": Cosine(0.77)})
     table = ByAngle.of(c.angle_deg, c.values_degC)
     level = {name: m - m[0] for name, m in table.median_K.items()}
@@ -98,7 +98,7 @@ def _cylinder_numbers(case: Case, truth_degC: float, level_K: dict[str, Float]) 
         Number(f"peak to peak of the medians, 0-60°: {n}", float(np.ptp(y)), "K", said.get(n), None, bar.get(n))
         for n, y in level_K.items()
     ]
-    mesh = case.result.mesh
+    mesh = case.result.mesh_in_world
     T, ok = mesh.temperature_degC, mesh.measured
     error = float(np.median(T[ok]) - truth_degC)
     sigmas = error / float(np.median(mesh.uncertainty_K[ok]))
@@ -193,14 +193,14 @@ def _side_numbers(table: ByAngle) -> list[Number]:
 def _front_view(result: Result) -> int:
     """The view from the most frontal place."""
     assert result.mapped is not None
-    eye = result.mapped.views.T_world_thermal[:, :3, 3] - result.mesh.surface.vertices_m.mean(0)
-    front = axes_of(result.mesh.metadata)[2]
+    eye = result.mapped.views.T_world_thermal[:, :3, 3] - result.mesh_in_world.surface.vertices_m.mean(0)
+    front = axes_of(result.mesh_in_world.metadata)[2]
     return int(np.argmax(eye @ front / np.linalg.norm(eye, axis=1)))
 
 
 def _side_pictures(result: Result, c: Compared, frontal: int) -> list[Picture]:
     """A side as the views that face it have it, the frontal view uncorrected and corrected, and the whole result."""
-    count, ahead = len(result.mesh.surface), np.flatnonzero(c.rows.view == frontal)
+    count, ahead = len(result.mesh_in_world.surface), np.flatnonzero(c.rows.view == frontal)
 
     def column(values: Float, rows: NDArray) -> Float:
         return on_vertices(count, c.rows.vertex[rows], values[rows])
@@ -222,14 +222,14 @@ def _side_pictures(result: Result, c: Compared, frontal: int) -> list[Picture]:
 def _better_side(result: Result, c: Compared, facing: NDArray) -> str:
     """`left` or `right`: the side that more views face."""
     assert result.mapped is not None
-    right = axes_of(result.mesh.metadata)[0]
+    right = axes_of(result.mesh_in_world.metadata)[0]
     seen = np.unique(c.rows.vertex[facing])
-    return "left" if float(np.median(result.mesh.surface.normals[seen] @ right)) > 0 else "right"
+    return "left" if float(np.median(result.mesh_in_world.surface.normals[seen] @ right)) > 0 else "right"
 
 
 def _pictures(result: Result, maps: dict[str, NDArray], side: str) -> list[Picture]:
     """Maps (V,) on the surface, on one scale."""
-    (cast,) = cast_views(result.mesh.surface, axes_of(result.mesh.metadata), 420, views=(side,))
+    (cast,) = cast_views(result.mesh_in_world.surface, axes_of(result.mesh_in_world.metadata), 420, views=(side,))
     everything = np.concatenate([m[np.isfinite(m)] for m in maps.values()])
     lo, hi = np.percentile(everything, (2, 99))
     scale = Scale("inferno", float(np.floor(2 * lo) / 2), float(np.ceil(2 * hi) / 2), "°C", "")

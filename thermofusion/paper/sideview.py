@@ -120,7 +120,7 @@ def _axis_cosine(result: Result, rows: Observations) -> Float:
     """|n·z| of Eq. 28, kept off zero."""
     assert result.mapped is not None
     z = result.mapped.views.T_world_thermal[:, :3, 2]
-    n = result.mesh.surface.normals
+    n = result.mesh_in_world.surface.normals
     return np.clip(np.abs(np.einsum("ij,ij->i", n[rows.vertex].astype(np.float64), z[rows.view])), 0.05, 1)
 
 

@@ -78,7 +78,7 @@ def first_view(result: Result, scan: Scan, room_degC: float) -> View:
     """The first of a result's thermal views."""
     assert result.mapped is not None
     assert scan.thermal is not None
-    seen, surface = result.mapped, result.mesh.surface
+    seen, surface = result.mapped, result.mesh_in_world.surface
     rows = seen.observations.select(seen.observations.view == 0)
     T, camera = seen.views.T_world_thermal[0], scan.thermal.camera
     band = Band(*camera.band_um)
@@ -86,7 +86,7 @@ def first_view(result: Result, scan: Scan, room_degC: float) -> View:
     columns = (rows.radiance, rows.cos_angle, cos_axis, rows.u_px, rows.v_px)
     radiance, *others = (on_vertices(len(surface), rows.vertex, x) for x in columns)
     apparent_degC = band.temperature_K(radiance) - ZERO_DEGC_K
-    axes = axes_of(result.mesh.metadata)
+    axes = axes_of(result.mesh_in_world.metadata)
     return View(surface, camera.lens, band, room_degC, T, axes, apparent_degC, radiance, *others)
 
 

@@ -181,7 +181,6 @@ def _temperature(t: Temperature) -> dict[str, Any]:
         "level_sigma_K": t.level_sigma_K,
         "flags": flags,
         "crosscal": t.crosscal,
-        "methods": t.methods,
     }
 
 

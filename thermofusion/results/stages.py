@@ -144,6 +144,17 @@ def fingerprint(scan: Scan) -> str:
     return h.hexdigest()[:24]
 
 
+def run_id(key: str, output: object) -> str:
+    """The id that every file of a result carries: same input, same id."""
+    return _hash({"key": key, "output": output})[:12]
+
+
+def scan_id(scan: Scan) -> str:
+    """What tells one recording from another, wherever it lies: its name, and its streams' times."""
+    times = {k: s.times_s for k in ("depth", "color", "thermal") if (s := getattr(scan, k)) is not None}
+    return _hash({"name": scan.name, **times})[:16]
+
+
 def _hash(value: object) -> str:
     return hashlib.sha256(json.dumps(plain(value), sort_keys=True, default=str).encode()).hexdigest()[:24]
 

@@ -6,7 +6,6 @@ vertex is blended (`blend`), twice: the second time with what the first map tell
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -18,13 +17,12 @@ from ..mapping.observe import Mapped
 from ..physics.band import ZERO_DEGC_K
 from ..progress import Progress, silent
 from ..recipe import MappingSection, TemperatureSection
-from ..surface.surface import SurfaceResult
 from ..types import Float32, OutputMode, Scan, SurfaceMesh, ThermalMesh, VertexFlag
-from ..version import __version__
 from .blend import BlendResult, blend
 from .crosscal import Calibration, calibrate
 from .problem import ThermalProblem
 
+Sections = tuple[MappingSection, TemperatureSection]
 METHODS = ("nearest-view", "mean", "cos-resolution", "paper", "corrected-cos", "joint")
 CAVITY_FRACTION = 0.2  # of the hemisphere: beyond it reflection between body parts exceeds 0.1 K
 HIGH_RESIDUAL = 3.0  # views disagree by more than this many of their own sigmas: hair, clothes, motion
@@ -37,7 +35,7 @@ class Temperature:
 
     mesh : in the recipe's output mode. absolute_degC, normal_equivalent_degC, apparent_degC : (V,) float32.
     body_fraction : (V,) F, or None. level_sigma_K : one sigma of the level common to all vertices, by part; a single
-    vertex's absolute interval is √(uncertainty² + Σ level²). crosscal, methods : for the report.
+    vertex's absolute interval is √(uncertainty² + Σ level²). crosscal : for the report; methods : of old results.
     """
 
     mesh: ThermalMesh
@@ -71,22 +69,19 @@ class Temperature:
 
 def solve(
     scan: Scan,
-    surface: SurfaceResult,
+    mesh: SurfaceMesh,
     mapped: Mapped,
     *,
+    normal_window_m: float,
     mapping: MappingSection,
     temperature: TemperatureSection,
-    metadata: Mapping[str, str] | None = None,
-    compare: bool = False,
     progress: Progress = silent,
 ) -> Temperature:
     """The temperature of every vertex that was seen.
 
-    metadata : of the mesh: the recipe's name, which way is up and where the front is (`export.view_axes`). compare :
-    also compute every other method, for the report. Raises ScanError, RecipeError.
+    normal_window_m : over which the mesh's normals were averaged. Raises ScanError, RecipeError.
     """
-    mesh = surface.mesh
-    problem = ThermalProblem.of(scan, mesh, surface.normal_window_m, mapped, mapping, temperature)
+    problem = ThermalProblem.of(scan, mesh, normal_window_m, mapped, mapping, temperature)
     progress("temperature", 1, 4)
     calibration, notes = calibrated(problem)
     progress("temperature", 2, 4)
@@ -95,10 +90,9 @@ def solve(
     progress("temperature", 3, 4)
     result = blend(problem, calibration)
     progress("temperature", 4, 4)
-    known = _metadata(metadata) | {"scan": scan.name, "uncertainty": UNCERTAINTY_MEANS}
     body_fraction = None if problem.around is None else problem.around.body_fraction
     return Temperature(
-        mesh=_mesh(mesh, result, calibration, body_fraction, known),
+        mesh=_mesh(mesh, result, calibration, body_fraction),
         absolute_degC=_degC(result.absolute_K),
         normal_equivalent_degC=_degC(result.normal_equivalent_K),
         apparent_degC=_degC(result.apparent_K),
@@ -106,7 +100,6 @@ def solve(
         calibration=calibration,
         level_sigma_K=result.uncertainty.level_parts_K,
         crosscal={} if calibration is None else _crosscal_report(calibration, mapped),
-        methods=_other_methods(problem, calibration, result) if compare else {},
         messages=(*problem.room.assumed, *notes),
     )
 
@@ -121,14 +114,10 @@ def calibrated(problem: ThermalProblem) -> tuple[Calibration | None, tuple[str, 
     return calibration, calibration.messages
 
 
-def unmeasured(
-    surface: SurfaceMesh, temperature: TemperatureSection, metadata: Mapping[str, str] | None = None
-) -> Temperature:
+def unmeasured(surface: SurfaceMesh, temperature: TemperatureSection) -> Temperature:
     """The result of a scan without thermal frames: a surface, and no temperatures."""
     nan = np.full(len(surface), np.nan, np.float32)
-    mesh = ThermalMesh.from_temperature(
-        surface, nan, mode=temperature.output, anchored=False, metadata=_metadata(metadata)
-    )
+    mesh = ThermalMesh.from_temperature(surface, nan, mode=temperature.output, anchored=False)
     note = "the scan has no thermal stream: the mesh carries no temperatures"
     return Temperature(mesh, nan, nan, nan, messages=(note,))
 
@@ -141,7 +130,6 @@ def _mesh(
     result: BlendResult,
     calibration: Calibration | None,
     body_fraction: Float32 | None,
-    metadata: dict[str, str | float],
 ) -> ThermalMesh:
     flags = np.zeros(len(surface), np.uint8)
     flags[result.count == 1] |= np.uint8(VertexFlag.SINGLE_VIEW)
@@ -166,14 +154,8 @@ def _mesh(
         observations=result.count,
         flags=flags,
         uncertainty_parts=parts,
-        metadata={**metadata, **level},
+        metadata={"uncertainty": UNCERTAINTY_MEANS, **level},
     )
-
-
-def _metadata(known: Mapping[str, str] | None) -> dict[str, str | float]:
-    given = dict(known or {})
-    recipe = {"recipe": given.pop("recipe")} if "recipe" in given else {}
-    return {"version": __version__, **recipe, "frame": "world, metres, right-handed", **given}
 
 
 def _crosscal_report(c: Calibration, mapped: Mapped) -> dict[str, Any]:
@@ -196,14 +178,19 @@ def _crosscal_report(c: Calibration, mapped: Mapped) -> dict[str, Any]:
     }
 
 
-def _other_methods(
-    problem: ThermalProblem, calibration: Calibration | None, chosen: BlendResult
+def compare_methods(
+    scan: Scan, surface: SurfaceMesh, normal_window_m: float, mapped: Mapped, found: Temperature, recipe: Sections
 ) -> dict[str, dict[str, float]]:
-    """How every method's temperatures differ from the chosen one's, level removed."""
+    """How every method's temperatures differ from those found, level removed, K.
+
+    recipe : the sections (mapping, temperature) that the temperatures were found with.
+    """
+    problem = ThermalProblem.of(scan, surface, normal_window_m, mapped, *recipe)
+    problem = problem.informed(surface, found.absolute_degC.astype(np.float64) + ZERO_DEGC_K)
     out = {}
     for method in METHODS:
         other = replace(problem, settings=problem.settings.model_copy(update={"method": method}))
-        d = blend(other, calibration).temperature_K - chosen.temperature_K
+        d = blend(other, found.calibration).temperature_K - ZERO_DEGC_K - found.mesh.temperature_degC
         d = d[np.isfinite(d)]
         level = float(np.median(d))
         left = d - level
