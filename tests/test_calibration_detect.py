@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 import pytest
 from support.simulated_pictures import Pictures, sensor_pattern, thermal_picture
-from support.simulated_rig import Noise, SimulatedRig, plane_depth, simulate_set, true_pixels
+from support.simulated_rig import Noise, SimulatedRig, picks_csv, plane_depth, simulate_set, true_pixels
 
 from thermofusion.calibration import Board, board_pdf, board_svg, calibrate
-from thermofusion.calibration.board.picks import read_picks_csv, write_picks_csv
+from thermofusion.calibration.board.picks import read_picks_csv
 from thermofusion.calibration.board.print import draw_board
-from thermofusion.calibration.board.views import BoardPoints, CalibrationSet, View
+from thermofusion.calibration.board.views import BoardPoints, BoardView, CalibrationSet
 from thermofusion.calibration.detect.blobs import detect_blobs
 from thermofusion.calibration.detect.color import detect_color
 from thermofusion.calibration.detect.dropouts import register_dropouts
@@ -93,7 +93,7 @@ def test_heated_mask_boards_of_others():
     board = Board("mask", 12, 8, 0.025)
     points = {p.stem: detect_blobs(cv2.imread(str(p), -1), board) for p in sorted((DATA / "thermalvis").glob("*.png"))}
     assert all(p is not None and len(p) > 90 for p in points.values())
-    views = tuple(View(n, {"thermal": p}) for n, p in points.items() if p is not None)
+    views = tuple(BoardView(n, {"thermal": p}) for n, p in points.items() if p is not None)
     s = fit_camera(CalibrationSet(board, {"thermal": (640, 480)}, views), "thermal")
     assert s.rms_px < 0.6
     assert abs(s.model.focal_px / 608.5 - 1) < 0.03  # five of the author's twenty pictures
@@ -202,7 +202,7 @@ def test_picks_round_trip_and_name_the_faulty_line(tmp_path):
     board = Board("pins", 9, 9, 0.05)
     data, _, _ = simulate_set(SimulatedRig(), 0, views=3, noise=Noise(missing=0.3), with_depth=False)
     file = tmp_path / "picks.csv"
-    file.write_text(write_picks_csv(file, list(data.views)))
+    file.write_text(picks_csv(data))
     for a, b in zip(read_picks_csv(file, board), data.views, strict=True):
         for camera in ("color", "thermal"):
             np.testing.assert_array_equal(a.points[camera].index, b.points[camera].index)

@@ -8,10 +8,9 @@ import cv2
 import numpy as np
 import pytest
 from support.simulated_disparity import NONE, disparity_image, true_parameters
-from support.simulated_rig import SimulatedRig, simulate_set
+from support.simulated_rig import SimulatedRig, picks_csv, simulate_set
 
 from thermofusion.calibration import calibrate, rig_document
-from thermofusion.calibration.board.picks import write_picks_csv
 from thermofusion.calibration.fit.cameras import to_rt
 from thermofusion.calibration.fit.depth_model import DisparityDepth
 from thermofusion.calibration.folder import open_folder
@@ -33,7 +32,7 @@ def folder(tmp_path_factory):
     (root / "disparity").mkdir()
     for i, (view, T) in enumerate(zip(data.views, poses, strict=True)):
         cv2.imwrite(str(root / "disparity" / f"{view.name}.png"), disparity_image(RIG, T, MODEL, THETA, i))
-    (root / "picks.csv").write_text(write_picks_csv(root / "picks.csv", list(data.views)))
+    (root / "picks.csv").write_text(picks_csv(data))
     b = RIG.board
     config = {
         "board": {"kind": b.kind, "columns": b.columns, "rows": b.rows, "spacing_m": b.spacing_m},

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from support.simulated_rig import Noise, SimulatedRig, mirrored, simulate_set, true_pixels
 
 from thermofusion.calibration.board.board import Board
-from thermofusion.calibration.board.views import BoardPoints, CalibrationSet, View
+from thermofusion.calibration.board.views import BoardPoints, BoardView, CalibrationSet
 from thermofusion.calibration.fit.bundle import Options, Problem
 from thermofusion.calibration.fit.cameras import (
     from_rt,
@@ -176,7 +176,7 @@ def test_a_knocked_tripod_and_a_bad_view_are_named(rig):
         assert c.fit.rms_px("thermal", set(c.grouping.names(k))) < 0.6
     for name in ("color", "thermal"):
         assert abs(c.fit.block(name)[0] / c.single[name].intrinsics[0] - 1) < 0.03
-    held_out = View("new", {"color": data.views[0].points["color"], "thermal": data.views[0].points["thermal"]})
+    held_out = BoardView("new", {"color": data.views[0].points["color"], "thermal": data.views[0].points["thermal"]})
     assert np.sqrt(np.mean(np.sum(predict_px(c, held_out, group=0) ** 2, axis=1))) < 2.0
 
 
@@ -208,7 +208,9 @@ def test_mirrored_pictures_are_refused(rig):
 
 def test_unusable_views_say_what_to_do(rig):
     board = rig.board
-    flat = [View(str(i), {"color": BoardPoints(np.arange(81), true_pixels(rig, "color", _flat(i)))}) for i in range(6)]
+    flat = [
+        BoardView(str(i), {"color": BoardPoints(np.arange(81), true_pixels(rig, "color", _flat(i)))}) for i in range(6)
+    ]
     data = CalibrationSet(board, {"color": (1280, 960)}, tuple(flat))
     with pytest.raises(ScanError, match=r"parallel.*tilt the board"):
         calibrate_views(data)
@@ -243,11 +245,20 @@ def test_a_rig_file_round_trip_with_covariances_and_report(calibrated, tmp_path)
     (tmp_path / "bad.json").write_text('{"schema": "thermofusion-rig/1", "cameras": {}}')
     with pytest.raises(ScanError, match="extrinsics"):
         read_rig(tmp_path / "bad.json")
+    (tmp_path / "bad.json").write_text('{"schema": "thermofusion-scan/1", "cameras": {}, "extrinsics": {}}')
+    with pytest.raises(ScanError, match="key 'schema': expected 'thermofusion-rig/1'"):
+        read_rig(tmp_path / "bad.json")
+    assert list(c.cameras) == ["color", "thermal", "depth"]  # and so the report's columns, on every run
 
 
-def test_advice_names_the_empty_part(rig):
+def test_without_depth_the_rig_hangs_on_colour_and_advice_names_the_empty_part(rig, tmp_path):
     data, _, _ = simulate_set(rig, 5, views=12, with_depth=False)
     c = calibrate_views(data)
+    write_rig(tmp_path / "rig.json", rig_document(c))
+    back = read_rig(tmp_path / "rig.json")
+    np.testing.assert_array_equal(back.extrinsics["T_thermal_color"], c.extrinsics["T_thermal_color"])
+    with pytest.raises(ScanError, match="without a depth camera"):
+        back.rig()
     some = coverage(c, "color")
     empty = replace(some, counts=np.array([[0, 9, 9], [9, 9, 9], [9, 9, 9]]))
     assert any("upper left" in s for s in advice(empty))

@@ -11,7 +11,7 @@ from support.simulated_pictures import Kinect, Pictures, color_picture, depth_pi
 from support.simulated_rig import SimulatedRig, board_poses, true_pixels
 
 from thermofusion.calibration import calibrate, calibrate_views
-from thermofusion.calibration.board.views import CalibrationSet, View
+from thermofusion.calibration.board.views import BoardView, CalibrationSet
 from thermofusion.calibration.detect.color import detect_color
 from thermofusion.calibration.fit.cameras import intrinsics_of, to_rt
 from thermofusion.calibration.fit.rounds import detect_thermal_set
@@ -80,7 +80,9 @@ def test_a_boards_bright_edge_is_not_taken_for_a_row_of_pins(rig, tmp_path):
     poses = write_folder(tmp_path / "day", rig, 1, views=6, pictures=replace(Pictures(), board_warmer=60.0))
     folder = open_folder(tmp_path / "day")
     colour = {n: detect_color(folder.color(n), rig.board) for n in folder.names}
-    data = CalibrationSet(rig.board, {"color": (1280, 960)}, tuple(View(n, {"color": p}) for n, p in colour.items()))
+    data = CalibrationSet(
+        rig.board, {"color": (1280, 960)}, tuple(BoardView(n, {"color": p}) for n, p in colour.items())
+    )
     found, _ = detect_thermal_set(data, {n: folder.thermal(n) for n in folder.names})
     for v in found.seen_by("thermal"):
         p = v.points["thermal"]

@@ -13,6 +13,7 @@ from thermofusion.calibration.thermal.noise import allan_deviation, edge_spread,
 from thermofusion.calibration.thermal.radiometric import check_monotone, evaluate, fit_field, fit_planck, fit_polynomial
 from thermofusion.calibration.thermal.timeoffset import estimate_time_offset, nearest_centroid, warm_centroid
 from thermofusion.errors import ScanError
+from thermofusion.report.plot import LogAxis
 
 # The curve of the paper's camera, digits as stored by its authors.
 EQ1 = (-3.459387450320374e05, 56.540702698830174, -3.46948481e-03, 9.47054240e-08, -9.69938020e-13)
@@ -87,6 +88,8 @@ def test_noise_drift_and_allan_deviation():
     np.testing.assert_allclose(a, 3 * tau / np.sqrt(2), rtol=1e-9)
     with pytest.raises(ScanError, match="too few"):
         still_noise(frames[:3], t[:3])
+    axis = LogAxis.over("s", [0.1, 30.0])
+    assert [axis.text(v) for v in axis.ticks()] == ["0.1", "0.2", "0.5", "1", "2", "5", "10", "20"]
 
 
 @pytest.mark.parametrize("sigma", [0.6, 1.0, 1.8])

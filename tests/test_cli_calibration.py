@@ -13,9 +13,8 @@ import pytest
 import scipy.io
 from scipy.special import ndtr
 from support import scan_maker as make
-from support.simulated_rig import SimulatedRig, simulate_set
+from support.simulated_rig import SimulatedRig, picks_csv, simulate_set
 
-from thermofusion.calibration.board.picks import write_picks_csv
 from thermofusion.calibration.thermal.blackbody import read_curve, read_field, write_field
 from thermofusion.calibration.thermal.radiometric import PixelField, evaluate
 from thermofusion.cli import main
@@ -235,7 +234,7 @@ def test_a_rig_says_when_what_the_counts_mean_and_how_late(session, tmp_path, ca
         for view in data.views:
             cv2.imwrite(str(tmp_path / camera / f"{view.name}.png"), np.zeros((h, w), np.uint8))
             os.utime(tmp_path / camera / f"{view.name}.png", (1_777_900_000, 1_777_900_000))
-    (tmp_path / "picks.csv").write_text(write_picks_csv(tmp_path / "picks.csv", list(data.views)))
+    (tmp_path / "picks.csv").write_text(picks_csv(data))
     b = rig.board
     board = {"kind": b.kind, "columns": b.columns, "rows": b.rows, "spacing_m": b.spacing_m}
     (tmp_path / "calibration.json").write_text(json.dumps({"board": board, "picks": "picks.csv"}))

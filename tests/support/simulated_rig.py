@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermofusion.calibration.board.board import Board
-from thermofusion.calibration.board.views import BoardPoints, CalibrationSet, View
+from thermofusion.calibration.board.views import BoardPoints, BoardView, CalibrationSet
 from thermofusion.calibration.fit.cameras import rotations
 from thermofusion.geometry.camera import distort, project
 from thermofusion.geometry.rigid import pose, se3_exp
@@ -108,7 +108,7 @@ def simulate_set(
             px[wild] += rng.uniform(-20, 20, (wild.sum(), 2))
             kept = rng.random(len(px)) >= (noise.missing if camera == "thermal" else 0)
             points[camera] = BoardPoints(np.flatnonzero(kept), px[kept])
-        out.append(View(name, points))
+        out.append(BoardView(name, points))
         if with_depth:
             depth[name] = _depth_loader(rig, T, noise.depth_m, int(rng.integers(2**31)))
     sizes = {n: (rig.camera(n).width_px, rig.camera(n).height_px) for n in ("color", "thermal")}
@@ -143,3 +143,12 @@ def mirrored(data: CalibrationSet, camera: str) -> CalibrationSet:
         p = v.points[camera]
         views.append(v.with_points(camera, BoardPoints(p.index, p.px * [-1, 1] + [width - 1, 0])))
     return replace(data, views=tuple(views))
+
+
+def picks_csv(data: CalibrationSet) -> str:
+    """The text of a picks file with all points of a set, to 4 decimals of a pixel."""
+    rows = ["view,camera,point,u_px,v_px"]
+    for view in data.views:
+        for camera, p in view.points.items():
+            rows += [f"{view.name},{camera},{i},{u:.4f},{v:.4f}" for i, (u, v) in zip(p.index, p.px, strict=True)]
+    return "\n".join(rows) + "\n"

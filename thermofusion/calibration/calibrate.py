@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ScanError
+from ..progress import Progress, silent
 from ..types import Float, UInt8
 from .board.board import Board
 from .board.picks import interpolated, read_picks_csv, read_picks_mat
-from .board.views import BoardPoints, CalibrationSet, View
+from .board.views import BoardPoints, BoardView, CalibrationSet
 from .detect.blobs import detect_blobs
 from .detect.color import detect_color
 from .detect.pictures import draw_points, to_grey
@@ -28,12 +30,12 @@ from .folder import CalibrationFolder, open_folder
 MIN_SHARE_FOUND = 0.3  # of the pictures; below this the board described is not the one in view
 MAX_INTERPOLATED = 0.3  # of picked points; more says that nobody looked at most of them
 PICTURES_CHECKED = 3  # for a second board, and for a board of another size
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
 class Calibrated:
     """The result. rejected_px : camera -> view -> (N, 2) places of board points that were looked for and not taken.
+
     found : camera -> number of views with the board. advice : what to record next."""
 
     folder: CalibrationFolder
@@ -59,7 +61,7 @@ def calibrate(
     picks: Path | None = None,
     free_spacing: bool | None = None,
     group: int | None = None,
-    progress: Progress = lambda _: None,
+    progress: Progress = silent,
 ) -> Calibrated:
     """Calibrate from a folder (see `folder`). picks : CSV or picks.mat used instead of detection where it has points.
 
@@ -75,10 +77,9 @@ def calibrate(
         data, rejected = _detect(folder, progress)
         if "infrared" in folder.files:
             data = _with_infrared(folder, data, progress)
-    depth: dict[str, Callable[[], NDArray]] = {
-        n: _loader(folder, n) for n in folder.files.get("depth", {}) if any(v.name == n for v in data.views)
-    }
-    progress("adjusting all cameras together")
+    named = {v.name for v in data.views}
+    depth = {n: partial(folder.depth, n) for n in folder.files.get("depth", {}) if n in named}
+    progress("adjust", 0, 1)
     result = calibrate_views(
         data,
         depth_images=depth or None,
@@ -89,19 +90,19 @@ def calibrate(
         free_spacing=folder.free_spacing if free_spacing is None else free_spacing,
         group=group,
     )
+    progress("adjust", 1, 1)
     found = {c: len(data.seen_by(c)) for c in data.cameras}
+    return Calibrated(folder, result, rejected, found, _next_steps(folder, result, data if source else None))
+
+
+def _next_steps(folder: CalibrationFolder, result: Calibration, picked: CalibrationSet | None) -> tuple[str, ...]:
+    """What to record, or pick, next; the gravest first."""
     next_steps = tuple(s for c in result.single for s in advice(coverage(result, c)))
     burnt = [n for n in folder.files.get("thermal", {}) if n in result.views_used() and is_saturated(folder.thermal(n))]
     if burnt:
         text = f"{len(burnt)} thermal pictures are saturated ({', '.join(burnt[:5])}): widen the temperature range"
         next_steps = (text, *next_steps)
-    if source is not None:
-        next_steps = (*_interpolated_picks(data), *next_steps)
-    return Calibrated(folder, result, rejected, found, next_steps)
-
-
-def _loader(folder: CalibrationFolder, name: str) -> Callable[[], NDArray]:
-    return lambda: folder.depth(name)
+    return next_steps if picked is None else (*_interpolated_picks(picked), *next_steps)
 
 
 def _from_picks(folder: CalibrationFolder, path: Path) -> CalibrationSet:
@@ -140,37 +141,35 @@ def _interpolated_picks(data: CalibrationSet) -> list[str]:
 
 def _detect(folder: CalibrationFolder, progress: Progress) -> tuple[CalibrationSet, dict[str, dict[str, Float]]]:
     """Points of both cameras: patches directly; pins in the thermal camera from the colour camera's boards."""
-    views = {n: View(n) for n in folder.names}
+    views = {n: BoardView(n) for n in folder.names}
     sizes: dict[str, tuple[int, int]] = {}
     by_patch = folder.board.kind in ("mask", "circles", "asymmetric-circles", "lamps")
     if "color" in folder.files:
-        progress("looking for the board in the colour pictures")
-        found, sizes["color"] = _find(folder, "color", detect_color if not by_patch else detect_patches)
+        found, sizes["color"] = _find(folder, "color", detect_patches if by_patch else detect_color, progress)
         views = {n: v.with_points("color", found.get(n)) for n, v in views.items()}
     rejected: dict[str, dict[str, Float]] = {}
     if "thermal" not in folder.files:
         return CalibrationSet(folder.board, sizes, tuple(views.values())), rejected
-    progress("looking for the board in the thermal pictures")
     if by_patch or "color" not in folder.files:
-        found, sizes["thermal"] = _find(folder, "thermal", detect_patches)
+        found, sizes["thermal"] = _find(folder, "thermal", detect_patches, progress)
         views = {n: v.with_points("thermal", found.get(n)) for n, v in views.items()}
         return CalibrationSet(folder.board, sizes, tuple(views.values())), rejected
     images = {n: folder.thermal(n) for n in folder.files["thermal"]}
-    data, detections = detect_thermal_set(CalibrationSet(folder.board, sizes, tuple(views.values())), images)
+    data, detections = detect_thermal_set(CalibrationSet(folder.board, sizes, tuple(views.values())), images, progress)
     rejected["thermal"] = {n: d.tried[~d.accepted] for n, d in detections.items()}
     return data, rejected
 
 
 def _with_infrared(folder: CalibrationFolder, data: CalibrationSet, progress: Progress) -> CalibrationSet:
     """The set with the depth camera's points, from its own pictures."""
-    progress("looking for the board in the infrared pictures")
-    found, size = _find(folder, "infrared", detect_patches)
+    found, size = _find(folder, "infrared", detect_patches, progress)
     views = tuple(v.with_points("depth", found.get(v.name)) for v in data.views)
     return replace(data, image_size={**data.image_size, "depth": size}, views=views)
 
 
 def detect_patches(image: NDArray, board: Board) -> BoardPoints | None:
-    """Circles, holes and lamps in any picture; checkerboards under a lamp by the colour detector on the grey values."""
+    """Circles, holes and lamps in any picture (H, W), px; checkerboards under a lamp by the colour detector on the grey
+    values."""
     if board.kind in ("mask", "circles", "lamps"):
         return detect_blobs(image, board)
     lo, hi = np.percentile(image, [0.5, 99.5])
@@ -204,11 +203,14 @@ def _other_size(folder: CalibrationFolder, camera: str) -> tuple[int, int] | Non
 
 
 def _find(
-    folder: CalibrationFolder, camera: str, detector: Callable[[NDArray, Board], BoardPoints | None]
+    folder: CalibrationFolder, camera: str, detector: Callable[[NDArray, Board], BoardPoints | None], progress: Progress
 ) -> tuple[dict[str, BoardPoints], tuple[int, int]]:
+    """The board in every picture of a camera by view, and the pictures' size. Raises ScanError: two boards, too few."""
     found: dict[str, BoardPoints] = {}
     shapes, saturated = set(), 0
-    for name in folder.files[camera]:
+    count = len(folder.files[camera])
+    for i, name in enumerate(folder.files[camera]):
+        progress(f"{camera} boards", i, count)
         image = getattr(folder, camera)(name)
         shapes.add(image.shape[:2])
         saturated += camera == "thermal" and is_saturated(image)
@@ -224,17 +226,22 @@ def _find(
         found[name] = points
     if len(shapes) != 1:
         raise ScanError(f"the {camera} pictures differ in size", place=folder.root, hint="keep one camera to a folder")
-    count = len(folder.files[camera])
     if len(found) < max(3, MIN_SHARE_FOUND * count):
-        board = folder.board
-        if saturated > count / 2:
-            cause, hint = f"{saturated} of {count} thermal pictures are saturated", "widen the temperature range"
-        else:
-            what = f"a {board.kind} of {board.columns} x {board.rows} points"
-            cause = f"{what} was found in {len(found)} of {count} {camera} pictures"
-            actual = _other_size(folder, camera)
-            cause += "" if actual is None else f", but one of {actual[0]} x {actual[1]}"
-            hint = "check columns and rows (inner corners), and that the whole board, and only one, is in view"
-        raise ScanError(cause, place=folder.root, hint=hint)
+        raise _too_few(folder, camera, len(found), saturated)
+    progress(f"{camera} boards", count, count)
     h, w = shapes.pop()
     return found, (int(w), int(h))
+
+
+def _too_few(folder: CalibrationFolder, camera: str, found: int, saturated: int) -> ScanError:
+    """Why the board was found in so few pictures, and what to do."""
+    board, count = folder.board, len(folder.files[camera])
+    if saturated > count / 2:
+        cause = f"{saturated} of {count} thermal pictures are saturated"
+        return ScanError(cause, place=folder.root, hint="widen the temperature range")
+    what = f"a {board.kind} of {board.columns} x {board.rows} points"
+    cause = f"{what} was found in {found} of {count} {camera} pictures"
+    actual = _other_size(folder, camera)
+    cause += "" if actual is None else f", but one of {actual[0]} x {actual[1]}"
+    hint = "check columns and rows (inner corners), and that the whole board, and only one, is in view"
+    return ScanError(cause, place=folder.root, hint=hint)

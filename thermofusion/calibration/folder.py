@@ -15,7 +15,6 @@ name: the same name in two patterns is the same moment. Only `board` is required
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, date, datetime
@@ -25,24 +24,21 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field
 
 from ..errors import ScanError
-from ..files.reading import depth_from_raw, inside, read_image
+from ..files.reading import depth_from_raw, inside, read_image, read_json
+from ..files.strict import ClosedBorder, validated
 from ..types import Camera, Float, check_rigid
 from .board.board import Board
+from .detect.depth_samples import NO_DISPARITY
 from .thermal.source import RawLayout
 
 FILE = "calibration.json"
-NO_DISPARITY = 2047  # a Kinect's eleven bits of 1
-SUFFIXES = ("png", "jpg", "tiff", "tif", "pgm", "raw")
+PICTURE_SUFFIXES = ("png", "jpg", "tiff", "tif", "pgm", "raw")
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
-
-
-class _BoardDoc(_Strict):
+class _BoardDoc(ClosedBorder):
     kind: str = "checkerboard"
     columns: int
     rows: int
@@ -50,37 +46,37 @@ class _BoardDoc(_Strict):
     mark_ratio: float = 0.5
 
 
-class _Lens(_Strict):
+class _Lens(ClosedBorder):
     width_px: int
     height_px: int
     K: list[list[float]]
-    distortion: list[float] = []
+    distortion: list[float] = Field(default_factory=list)
 
 
-class _DepthDoc(_Strict):
+class _DepthDoc(ClosedBorder):
     unit_m: float = Field(0.001, gt=0)
-    invalid: list[int] = [0]
+    invalid: list[int] = Field(default_factory=lambda: [0])
     kind: Literal["metric", "disparity"] = "metric"
     camera: _Lens | None = None
     lens_known: bool = False
     T_depth_color: list[list[float]] | None = None
 
 
-class _RawDoc(_Strict):
+class _RawDoc(ClosedBorder):
     width_px: int = Field(gt=0)
     height_px: int = Field(gt=0)
     big_endian: bool = False
     header_bytes: int = Field(0, ge=0)
 
 
-class _Config(_Strict):
+class _Config(ClosedBorder):
     board: _BoardDoc
-    files: dict[Literal["color", "thermal", "depth", "infrared"], str] = {}
+    files: dict[Literal["color", "thermal", "depth", "infrared"], str] = Field(default_factory=dict)
     depth: _DepthDoc = _DepthDoc()
     thermal_raw: _RawDoc | None = None
     picks: str | None = None
     free_spacing: bool = False
-    mirrored: list[Literal["color", "thermal", "depth"]] = []
+    mirrored: list[Literal["color", "thermal", "depth"]] = Field(default_factory=list)
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,10 +195,7 @@ def _load(root: Path, config: Mapping[str, Any] | None, board: Board | None) -> 
     if config is not None:
         tree = dict(config)
     elif path.is_file():
-        try:
-            tree = json.loads(path.read_text(encoding="utf-8"))
-        except (UnicodeDecodeError, json.JSONDecodeError) as e:
-            raise ScanError(f"not valid JSON: {e}", place=path) from None
+        tree = read_json(path)
     else:
         tree = {}
     if board is not None:
@@ -211,22 +204,17 @@ def _load(root: Path, config: Mapping[str, Any] | None, board: Board | None) -> 
         raise ScanError(
             "the board is not described", place=path, hint="write `board`, or give --board on the command line"
         )
-    try:
-        return _Config.model_validate(tree)
-    except ValidationError as e:
-        fault = e.errors()[0]
-        key = ".".join(str(p) for p in fault["loc"])
-        raise ScanError(f"key '{key}': {fault['msg'][0].lower()}{fault['msg'][1:]}", place=path) from None
+    return validated(_Config, tree, path)
 
 
 def _matching(root: Path, pattern: str) -> dict[str, Path]:
-    """View name (what the star stands for) -> file."""
+    """BoardView name (what the star stands for) -> file."""
     if pattern.count("*") != 1 or ".." in Path(pattern).parts or Path(pattern).is_absolute():
         raise ScanError(f"the pattern '{pattern}' must lie in the folder and hold one star", place=root / FILE)
     head, tail = Path(pattern).name.split("*")
     out = {}
     for path in sorted((root / pattern).parent.glob(Path(pattern).name)):
-        if path.is_file() and path.suffix.lstrip(".").lower() in SUFFIXES:
+        if path.is_file() and path.suffix.lstrip(".").lower() in PICTURE_SUFFIXES:
             name = path.name[len(head) : len(path.name) - len(tail)]
             out[name if tail else Path(name).stem] = path
     return out

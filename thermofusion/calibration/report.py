@@ -10,21 +10,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..report.page import html_page
 from ..types import Float
-from .fit.cameras import INTRINSIC_NAMES, to_rt
+from .fit.cameras import INTRINSIC_NAMES, SHIFT, TURN, to_rt
 from .fit.coverage import coverage
 from .fit.rig import Calibration
 from .rig_file import figures
 
-WIDTH, HEIGHT = 420, 300
+WIDTH, HEIGHT = 420, 300  # px of a plot
 COLORS = {"color": "#1f6feb", "thermal": "#d1242f", "depth": "#1a7f37"}
-STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem;color:#1f2328}
-table{border-collapse:collapse;margin:.5rem 0}
-td,th{padding:.15rem .7rem;border-bottom:1px solid #d0d7de;text-align:right}
-td:first-child,th:first-child{text-align:left}
-.warn{background:#fff8c5;padding:.4rem .8rem;border-left:4px solid #d4a72c}
+STYLE = """.warn{background:#fff8c5;padding:.4rem .8rem;border-left:4px solid #d4a72c}
 figure{display:inline-block;margin:.5rem 1rem .5rem 0;vertical-align:top}figcaption{font-size:.85rem;color:#57606a}
-svg{background:#fff;border:1px solid #d0d7de}img{max-width:100%}"""
+svg{background:#fff;border:1px solid #d0d7de}"""
 
 
 def report_html(
@@ -56,13 +53,7 @@ def report_html(
         "<h2>Points found</h2>" if pictures else "",
         *(_picture(caption, image) for caption, image in (pictures or {}).items()),
     ]
-    policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
-    return (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><meta http-equiv="Content-Security-Policy" '
-        f'content="{policy}"><title>thermofusion calibration</title><style>{STYLE}</style></head><body>'
-        + "\n".join(b for b in body if b)
-        + "</body></html>\n"
-    )
+    return html_page("thermofusion calibration", "\n".join(b for b in body if b), style=STYLE)
 
 
 def _summary(calibration: Calibration, f: dict) -> str:
@@ -102,7 +93,7 @@ def _extrinsics(calibration: Calibration) -> str:
     for name, T in calibration.extrinsics.items():
         rt = to_rt(T) * np.array([180 / np.pi] * 3 + [1e3] * 3)
         s = 1.96 * np.sqrt(np.diag(calibration.extrinsic_covariance[name])) * np.array([180 / np.pi] * 3 + [1e3] * 3)
-        rows.append([name, _list(rt[:3], 3), _list(s[:3], 3), _list(rt[3:], 2), _list(s[3:], 2)])
+        rows.append([name, _list(rt[TURN], 3), _list(s[TURN], 3), _list(rt[SHIFT], 2), _list(s[SHIFT], 2)])
     return _table(rows)
 
 

@@ -6,43 +6,29 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
 
 from ..errors import ScanError
+from ..files.reading import read_json
+from ..files.strict import validated
 from ..files.whole import write_text
+from ..scans.native.schema import STREAMS, RigDoc, RigExtrinsicsDoc, camera_of, matrix_of
 from ..types import Camera, Float, Rig, SignalCurve
 from .fit.cameras import INTRINSIC_NAMES
+from .fit.depth_model import DisparityDepth
 from .fit.rig import Calibration
+from .thermal.blackbody import signal_document
 
 SCHEMA = "thermofusion-rig/1"
 EXTRINSIC_ORDER = ("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m")
 
 
-class _Border(BaseModel):
-    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
-
-
-class _CameraDoc(_Border):
-    width_px: int
-    height_px: int
-    K: list[list[float]]
-    distortion: list[float]
-
-
-class _RigDoc(_Border):
-    schema_: Literal["thermofusion-rig/1"]
-    cameras: dict[str, _CameraDoc]
-    extrinsics: dict[str, list[list[float]]]
-    covariances: dict[str, list[list[float]]] = {}
-
-
 @dataclass(frozen=True, eq=False)
 class RigFile:
-    """cameras and transforms by name; covariances (6, 6) of (rotation vector [rad], translation [m]) by transform and
-    (9, 9) of the intrinsics by camera; `document` the whole file."""
+    """cameras and transforms (4, 4) by name; covariances (6, 6) of (rotation vector [rad], translation [m]) by
+    transform and (9, 9) of the intrinsics by camera; `document` the whole file."""
 
     cameras: dict[str, Camera]
     extrinsics: dict[str, Float]
@@ -69,8 +55,7 @@ def rig_document(
     fit = calibration.fit
     cameras = {name: _camera_doc(c) for name, c in sorted(calibration.cameras.items())}
     if curve is not None and "thermal" in cameras:
-        parameters = {k: list(v) if len(v) > 1 else v[0] for k, v in curve.parameters.items()}
-        cameras["thermal"]["signal"] = {"kind": curve.kind, "curve": {"type": curve.curve, **parameters}}
+        cameras["thermal"]["signal"] = signal_document(curve)
     if time_offset_s is not None and "thermal" in cameras:
         cameras["thermal"]["time_offset_s"] = time_offset_s
     covariances = {k: v.tolist() for k, v in calibration.extrinsic_covariance.items()}
@@ -121,31 +106,25 @@ def figures(calibration: Calibration) -> dict[str, Any]:
 
 
 def write_rig(path: Path, document: dict[str, Any]) -> None:
-    """Write rig.json whole or not at all."""
+    """Write rig.json whole or not at all. Raises ResourceError."""
     write_text(path, json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 
 
 def read_rig(path: Path) -> RigFile:
     """Read rig.json. Raises ScanError naming the key."""
-    try:
-        raw = json.loads(path.read_text(encoding="utf-8"))
-        doc = _RigDoc.model_validate({"schema_": raw.get("schema"), **raw})
-    except FileNotFoundError:
-        raise ScanError("there is no such rig file", place=path) from None
-    except (UnicodeDecodeError, json.JSONDecodeError, AttributeError) as e:
-        raise ScanError(f"not a rig file ({e})", place=path) from None
-    except ValidationError as e:
-        fault = e.errors()[0]
-        key = ".".join(str(p) for p in fault["loc"])
-        raise ScanError(f"key '{key}': {fault['msg'][0].lower()}{fault['msg'][1:]}", place=path) from None
-    try:
-        cameras = {
-            n: Camera(c.width_px, c.height_px, np.array(c.K), np.array(c.distortion)) for n, c in doc.cameras.items()
-        }
-    except ValueError as e:
-        raise ScanError(f"key 'cameras': {e}", place=path) from None
-    extrinsics = {k: np.array(v) for k, v in doc.extrinsics.items()}
-    return RigFile(cameras, extrinsics, {k: np.array(v) for k, v in doc.covariances.items()}, raw)
+    tree = read_json(path)
+    if not isinstance(tree, dict) or tree.get("schema") != SCHEMA:
+        raise ScanError(
+            f"key 'schema': expected '{SCHEMA}'", place=path, hint="write one with `thermofusion calibrate`"
+        )
+    doc = validated(RigDoc, tree, path)
+    if "extrinsics" not in doc.model_fields_set:
+        raise ScanError("key 'extrinsics': field required", place=path)
+    groups = {str(n): getattr(doc.cameras, n) for n in STREAMS}
+    cameras = {n: camera_of(c, f"cameras.{n}", path) for n, c in groups.items() if c is not None}
+    rows = {k: getattr(doc.extrinsics, k) for k in RigExtrinsicsDoc.model_fields}
+    extrinsics = {k: matrix_of(r, f"extrinsics.{k}", path) for k, r in rows.items() if r is not None}
+    return RigFile(cameras, extrinsics, {k: np.array(v) for k, v in doc.covariances.items()}, tree)
 
 
 def _camera_doc(c: Camera) -> dict[str, Any]:
@@ -159,7 +138,7 @@ def _depth_doc(calibration: Calibration) -> dict[str, Any] | None:
     values = calibration.fit.block("depth_model")
     sigma = np.sqrt(np.diag(calibration.fit.block_covariance("depth_model")))
     return {
-        "model": "disparity" if type(model).__name__ == "DisparityDepth" else "metric",
+        "model": "disparity" if isinstance(model, DisparityDepth) else "metric",
         "parameters": {n: float(v) for n, v in zip(model.names, values, strict=True)},
         "sigma": {n: float(s) for n, s in zip(model.names, sigma, strict=True)},
     }

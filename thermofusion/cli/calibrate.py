@@ -2,17 +2,36 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass, is_dataclass
 from datetime import datetime
+from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from ..errors import RecipeError
-from .console import emit, note
+from .console import emit, progress
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
-PICTURES_IN_REPORT = 12
+PICTURES_IN_REPORT = 12  # all of them lie inside the page
+
+
+def spelled_out(verb: Callable[..., None]) -> Callable[..., None]:
+    """A verb for typer: a parameter that is a dataclass becomes its fields, an option each."""
+    own = signature(verb, eval_str=True).parameters
+    kinds: dict[str, Any] = {n: p.annotation for n, p in own.items() if is_dataclass(p.annotation)}
+    bundles = {n: signature(kind, eval_str=True).parameters for n, kind in kinds.items()}
+
+    def flat(**given: Any) -> None:
+        packed = {n: kinds[n](**{k: given.pop(k) for k in fields}) for n, fields in bundles.items()}
+        verb(**given, **packed)
+
+    spelled = [p for n in own for p in (bundles[n].values() if n in bundles else [own[n]])]
+    flat.__signature__ = Signature([p.replace(kind=Parameter.KEYWORD_ONLY) for p in spelled])  # type: ignore[attr-defined]
+    flat.__name__, flat.__doc__ = verb.__name__, verb.__doc__
+    return flat
 
 
 def register(app: typer.Typer) -> None:
@@ -21,16 +40,25 @@ def register(app: typer.Typer) -> None:
     app.command()(board)
 
 
+@dataclass(frozen=True)
+class Besides:
+    """What a rig file says beside the cameras and their places."""
+
+    date: Annotated[str | None, typer.Option(help="ISO 8601; by default the day of the newest picture.")] = None
+    curve: Annotated[Path | None, typer.Option(help="curve.json of `thermal curve`: what the counts mean.")] = None
+    time_offset_s: Annotated[
+        float | None, typer.Option("--time-offset-s", min=-3600, max=3600, help="Of `thermal time-offset`.")
+    ] = None
+
+
+@spelled_out
 def calibrate(
     folder: Annotated[Path, typer.Argument(help="Pictures of the board and a calibration.json (docs/calibration.md).")],
     out: Annotated[Path, typer.Option("-o", "--out", help="Rig file to write.")] = Path("rig.json"),
     picks: Annotated[Path | None, typer.Option(help="Points picked by hand: CSV or picks.mat.")] = None,
     report: Annotated[Path | None, typer.Option(help="Report to write; beside the rig by default.")] = None,
-    date: Annotated[str | None, typer.Option(help="ISO 8601; by default the day of the newest picture.")] = None,
-    curve: Annotated[Path | None, typer.Option(help="curve.json of `thermal curve`: what the counts mean.")] = None,
-    time_offset_s: Annotated[
-        float | None, typer.Option("--time-offset-s", min=-3600, max=3600, help="Of `thermal time-offset`.")
-    ] = None,
+    *,
+    besides: Besides,
     json: Json = False,
 ) -> None:
     """Cameras and rig from pictures of a board: rig.json with covariances, and a report."""
@@ -39,13 +67,14 @@ def calibrate(
     from ..calibration.thermal.blackbody import read_curve
     from ..files.whole import write_text
 
-    day, radiometry = _day(date), None if curve is None else read_curve(curve)
-    done = solve(folder, picks=picks, progress=(lambda _: None) if json else note)
+    day, radiometry = _day(besides.date), None if besides.curve is None else read_curve(besides.curve)
+    with progress(json) as step:
+        done = solve(folder, picks=picks, progress=step)
     document = rig_document(
         done.calibration,
         date=day or done.folder.newest.isoformat(),
         curve=None if radiometry is None else radiometry.signal_curve(),
-        time_offset_s=time_offset_s,
+        time_offset_s=besides.time_offset_s,
         advice=done.advice,
     )
     if radiometry is not None:

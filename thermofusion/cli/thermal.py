@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ..errors import RecipeError, ScanError
-from .console import Progress, emit, low_high, note, progress
+from ..progress import Progress
+from .calibrate import spelled_out
+from .console import emit, low_high, note, progress
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -40,18 +43,33 @@ def register(app: typer.Typer) -> None:
     app.add_typer(verbs, name="thermal")
 
 
+@dataclass(frozen=True)
+class CurveModel:
+    """Which curve, over which counts."""
+
+    model: Annotated[str, typer.Option(help="polynomial (the paper's Eq. 1) or planck.")] = "polynomial"
+    degree: Annotated[int, typer.Option(min=1, max=6, help="Of the polynomial.")] = 4
+    free_F: Annotated[bool, typer.Option("--free-f", help="Planck: fit F too; takes a wide temperature range.")] = False
+    range_: Annotated[
+        str | None, typer.Option("--range", help="Counts the curve is for, low:high; all readings by default.")
+    ] = None
+
+    def fit(self, counts: NDArray, degC: NDArray, limits: tuple[float, float] | None) -> RadiometricCurve:
+        """To blackbody readings, counts (N,) and degC (N,). Raises ScanError."""
+        from ..calibration.thermal.radiometric import fit_planck, fit_polynomial
+
+        if self.model == "planck":
+            return fit_planck(counts, degC, fix_F=not self.free_F, counts_range=limits)
+        return fit_polynomial(counts, degC, degree=self.degree, counts_range=limits)
+
+
 @verbs.command()
+@spelled_out
 def curve(
     readings: Readings,
     out: Annotated[Path, typer.Option("-o", "--out", help="Curve file to write.")] = Path("curve.json"),
-    model: Annotated[str, typer.Option(help="polynomial (the paper's Eq. 1) or planck.")] = "polynomial",
-    degree: Annotated[int, typer.Option(min=1, max=6, help="Of the polynomial.")] = 4,
-    free_F: Annotated[
-        bool, typer.Option("--free-f", help="Planck: fit F too; takes a wide temperature range.")
-    ] = False,
-    range_: Annotated[
-        str | None, typer.Option("--range", help="Counts the curve is for, low:high; all readings by default.")
-    ] = None,
+    *,
+    chosen: CurveModel,
     raw: Raw = None,
     json: Json = False,
 ) -> None:
@@ -59,25 +77,21 @@ def curve(
     import numpy as np
 
     from ..calibration.thermal.blackbody import curve_document, read_readings, reading_counts, write_curve
-    from ..calibration.thermal.radiometric import fit_planck, fit_polynomial
 
-    if model not in ("polynomial", "planck"):
-        raise RecipeError(f"there is no model '{model}'", hint="choose polynomial or planck")
-    limits = low_high(range_, "counts")
+    if chosen.model not in ("polynomial", "planck"):
+        raise RecipeError(f"there is no model '{chosen.model}'", hint="choose polynomial or planck")
+    limits = low_high(chosen.range_, "counts")
     table = read_readings(readings)
     counts, degC = reading_counts(table, _opener(raw)), np.array([r.degC for r in table])
     try:
-        if model == "planck":
-            fitted = fit_planck(counts, degC, fix_F=not free_F, counts_range=limits)
-        else:
-            fitted = fit_polynomial(counts, degC, degree=degree, counts_range=limits)
+        fitted = chosen.fit(counts, degC, limits)
     except ScanError as e:
         raise ScanError(e.cause, place=readings, hint=e.hint) from None
     document = curve_document(fitted, len(table))
     write_curve(out, document)
     (lo, hi), (cold, warm) = document["counts_range"], document["degC_range"]
     text = (
-        f"{model} from {len(table)} readings, for {lo:.0f} to {hi:.0f} counts ({cold:.2f} to {warm:.2f} °C)\n"
+        f"{chosen.model} from {len(table)} readings, for {lo:.0f} to {hi:.0f} counts ({cold:.2f} to {warm:.2f} °C)\n"
         f"residual {fitted.residual_K * 1e3:.2f} mK rms; the curve itself is good to {fitted.sigma_K * 1e3:.2f} mK\n"
         f"wrote {out}"
     )

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from ..files.json import to_json
 from ..files.whole import write_text
+from ..report.page import html_page
 from ..report.plot import Panel, csv_text, page
 
 
@@ -106,7 +107,7 @@ class PaperReport:
             body += f"<h2>Not made</h2><ul>{items}</ul>"
         missed = "".join(f"<li>{escape(x)}</li>" for x in self.failed)
         verdict = f"<p>Bars missed:</p><ul>{missed}</ul>" if missed else "<p>All bars are met.</p>"
-        return _PAGE.replace("@VERDICT@", verdict).replace("@BODY@", body)
+        return html_page("The paper, reproduced", f"{_HEAD}{verdict}\n{body}\n", style=_STYLE, beside=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,19 +157,9 @@ def _section(f: FigureReport) -> str:
     return f"<h2>{escape(f.name)}: {escape(f.title)}</h2>{pictures}{table}{notes}<p class='data'>{data}</p>"
 
 
-_PAGE = """<!doctype html>
-<html lang="en"><meta charset="utf-8"><title>The paper, reproduced</title>
-<style>
-body { font: 15px/1.5 Helvetica, Arial, sans-serif; color: #222; max-width: 1080px; margin: 2rem auto; padding: 0 1rem }
-img { max-width: 100%; border: 1px solid #e3e3e3; margin: .4rem 0 }
-table { border-collapse: collapse; margin: .6rem 0 } th, td { padding: .2rem .7rem; border-bottom: 1px solid #e3e3e3;
-text-align: left } td.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap }
-tr.ok td:last-child::after { content: " ✓"; color: #009e73 } tr.missed td { color: #c03000 }
-h2 { margin-top: 2.2rem } .data { color: #777; font-size: 13px }
-</style>
-<h1>Three-Dimensional Quantitative Thermal Mapping of the Human Body, reproduced</h1>
+_STYLE = """img{border:1px solid #e3e3e3;margin:.4rem 0} td,th{text-align:left} h2{margin-top:2.2rem}
+td.n{text-align:right;font-variant-numeric:tabular-nums;white-space:nowrap} .data{color:#777;font-size:13px}
+tr.ok td:last-child::after{content:" ✓";color:#009e73} tr.missed td{color:#c03000}"""
+_HEAD = """<h1>Three-Dimensional Quantitative Thermal Mapping of the Human Body, reproduced</h1>
 <p>Figures of the paper by Cheng, Kandala and Herman beside ours. Made by <code>thermofusion paper</code>.</p>
-@VERDICT@
-@BODY@
-</html>
 """

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..export import palettes
-from ..types import UInt8
+from ..types import Float, UInt8
 
 BLUE, ORANGE, GREEN, PURPLE, SKY, AMBER, INK, GREY = (
     "#0072b2",
@@ -56,6 +56,37 @@ class Axis:
         if abs(self.step * 10**decimals - round(self.step * 10**decimals)) > 1e-9:
             decimals += 1
         return f"{value:.{decimals}f}".replace("-", "−")
+
+    def scaled(self, values: ArrayLike) -> Float:
+        """Values, any shape and unit, as they lie along the axis."""
+        return np.asarray(values, np.float64)
+
+
+@dataclass(frozen=True)
+class LogAxis(Axis):
+    """A logarithmic axis from lo to hi > 0 with ticks at 1, 2 and 5 of every decade."""
+
+    step: float = 1.0  # decades
+
+    @classmethod
+    def over(cls, label: str, values: ArrayLike) -> LogAxis:
+        """An axis over a little more than positive values, any shape and unit."""
+        lo, hi = float(np.log10(np.min(values))), float(np.log10(np.max(values)))
+        margin = max(0.05 * (hi - lo), 0.05)
+        return cls(label, 10 ** (lo - margin), 10 ** (hi + margin))
+
+    def ticks(self) -> list[float]:
+        """Values that carry a tick."""
+        decades = range(int(np.floor(np.log10(self.lo))), int(np.ceil(np.log10(self.hi))) + 1)
+        return [v for d in decades for m in (1, 2, 5) if self.lo <= (v := m * 10.0**d) <= self.hi]
+
+    def text(self, value: float) -> str:
+        """A tick's label: the number itself."""
+        return f"{value:g}"
+
+    def scaled(self, values: ArrayLike) -> Float:
+        """Decimal logarithms of values, any shape and unit."""
+        return np.log10(np.asarray(values, np.float64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,9 +154,11 @@ class Plot:
         w, h = width - _LEFT - _RIGHT, height - _TOP - _BOTTOM
 
         def at(x: ArrayLike, y: ArrayLike) -> tuple[NDArray, NDArray]:
-            px = _LEFT + w * (np.asarray(x, np.float64) - self.x.lo) / (self.x.hi - self.x.lo)
-            py = _TOP + h * (self.y.hi - np.asarray(y, np.float64)) / (self.y.hi - self.y.lo)
-            return px, py
+            (x_lo, x_hi), (y_lo, y_hi) = (a.scaled([a.lo, a.hi]) for a in (self.x, self.y))
+            return (
+                _LEFT + w * (self.x.scaled(x) - x_lo) / (x_hi - x_lo),
+                _TOP + h * (y_hi - self.y.scaled(y)) / (y_hi - y_lo),
+            )
 
         parts = [_text(_LEFT, 22, self.title, size=14, weight="600")]
         for v in self.x.ticks():

@@ -5,13 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+import cv2
 import numpy as np
 
 from ...errors import ScanError
 from ...types import Float
 
 BoardKind = Literal["checkerboard", "pins", "mask", "circles", "asymmetric-circles", "charuco", "lamps"]
-MAX_POINTS = 10_000
+MAX_POINTS = 10_000  # more is a slip of the keyboard, and would fill the memory
+ARUCO_DICTIONARY = cv2.aruco.DICT_5X5_1000  # of `charuco` boards: markers for 2000 squares
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,7 @@ class Board:
 
     @property
     def points_m(self) -> Float:
-        """(N, 3) points in the board frame, row by row, z = 0."""
+        """(N, 3) points in the board frame, m, row by row, z = 0."""
         v, u = np.divmod(np.arange(len(self)), self.columns)
         if self.kind == "mask":
             x, y = (2 * (k // 2 + (k % 2) * self.mark_ratio) * self.spacing_m for k in (u, v))
@@ -67,25 +69,11 @@ class Board:
 
     @property
     def extent_m(self) -> tuple[float, float]:
-        """Width and height spanned by the points."""
+        """Width and height spanned by the points, m."""
         p = self.points_m
         return float(p[:, 0].max()), float(p[:, 1].max())
 
     def outline_m(self, margin: float = 0.0) -> Float:
-        """(4, 3) corners of the rectangle round the points, grown by `margin` spacings on every side."""
+        """(4, 3) corners of the rectangle round the points, m, grown by `margin` spacings on every side."""
         (w, h), m = self.extent_m, margin * self.spacing_m
         return np.array([[-m, -m, 0], [w + m, -m, 0], [w + m, h + m, 0], [-m, h + m, 0]])
-
-    def symmetries(self) -> list[np.ndarray]:
-        """Renumberings (N,) under which an unmarked board looks the same from the front: half and, if square, quarter
-        turns. `grid[s[i]]` is where point i lies in the turned numbering."""
-        if self.kind in ("charuco",):
-            return [np.arange(len(self))]
-        if self.kind == "asymmetric-circles" and self.rows % 2 == 0:
-            return [np.arange(len(self))]
-        grid = np.arange(len(self)).reshape(self.rows, self.columns)
-        if self.kind == "asymmetric-circles":
-            # the half turn maps it onto itself only if first and last row start alike, which an odd count does
-            return [grid.ravel(), grid[::-1, ::-1].ravel()]
-        turns = range(4) if self.rows == self.columns else (0, 2)
-        return [np.rot90(grid, k).ravel() for k in turns]

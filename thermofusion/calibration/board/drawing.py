@@ -10,7 +10,7 @@ import numpy as np
 
 from ...types import Float
 
-POINT_PER_MM = 72 / 25.4
+POINT_PER_MM = 72 / 25.4  # PDF's unit is the point, 1/72 inch
 KAPPA = 0.5522847498  # handle length of the cubic that draws a quarter circle
 
 
@@ -27,6 +27,7 @@ class Page:
     texts: list[tuple[float, float, float, str]] = field(default_factory=list)  # x, baseline y, size, text
 
     def rectangle(self, x: float, y: float, w: float, h: float) -> None:
+        """A black rectangle of w x h mm, its top left corner at (x, y) mm."""
         self.polygons.append(np.array([[x, y], [x + w, y], [x + w, y + h], [x, y + h]]))
 
     def svg(self) -> str:

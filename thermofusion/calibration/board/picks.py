@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 
 from ...errors import ScanError
 from .board import Board
-from .views import BoardPoints, View
+from .views import CAMERAS, BoardPoints, BoardView
 
-CAMERAS = ("color", "thermal", "depth")
-INTERPOLATED_PX = 0.05  # no picture places a point this exactly on a grid again and again
+INTERPOLATED_PX = 0.05  # px; no picture places a point this exactly on a grid again and again
 
 
-def read_picks_csv(path: Path, board: Board) -> list[View]:
+def read_picks_csv(path: Path, board: Board) -> list[BoardView]:
     """Rows `view,camera,point,u_px,v_px`: point counts row by row from 0; camera is color, thermal or depth.
 
     Raises ScanError naming the line.
@@ -56,20 +55,11 @@ def read_picks_csv(path: Path, board: Board) -> list[View]:
         for c, a in arrays.items():
             if len(np.unique(a[:, 0])) < len(a):
                 raise ScanError(f"view '{name}' has a point of the {c} camera twice", place=path)
-        views.append(View(name, {c: BoardPoints(a[:, 0].astype(np.int64), a[:, 1:]) for c, a in arrays.items()}))
+        views.append(BoardView(name, {c: BoardPoints(a[:, 0].astype(np.int64), a[:, 1:]) for c, a in arrays.items()}))
     return views
 
 
-def write_picks_csv(path: Path, views: list[View]) -> str:
-    """The text of a picks file (the caller writes it), 4 decimals of a pixel."""
-    rows = ["view,camera,point,u_px,v_px"]
-    for view in views:
-        for camera, p in view.points.items():
-            rows += [f"{view.name},{camera},{i},{u:.4f},{v:.4f}" for i, (u, v) in zip(p.index, p.px, strict=True)]
-    return "\n".join(rows) + "\n"
-
-
-def read_picks_mat(path: Path, spacing_m: float) -> tuple[Board, dict[str, tuple[int, int]], list[View]]:
+def read_picks_mat(path: Path, spacing_m: float) -> tuple[Board, dict[str, tuple[int, int]], list[BoardView]]:
     """The toolbox's calibration file: `rgb_grid_p{1}` colour, `{2}` thermal, `rgb_grid_x` board points, `rfiles` names.
 
     Returns the board (a pin grid with `spacing_m`: the file's own square size is only somebody's assumption), image
@@ -98,7 +88,7 @@ def read_picks_mat(path: Path, spacing_m: float) -> tuple[Board, dict[str, tuple
         for camera, cells in zip(CAMERAS, picks, strict=False):
             if k < len(cells) and np.size(cells[k]):
                 points[camera] = BoardPoints(order, np.asarray(cells[k], np.float64).T)
-        views.append(View(Path(name).stem, points))
+        views.append(BoardView(Path(name).stem, points))
     image_size = {c: (int(s[1]), int(s[0])) for c, s in zip(CAMERAS, sizes, strict=False)}
     return board, image_size, views
 

@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 
 from ...errors import RecipeError
-from ..detect.color import ARUCO_DICTIONARY
-from .board import Board
+from .board import ARUCO_DICTIONARY, Board
 from .drawing import Page
 
 PAPER_MM = {

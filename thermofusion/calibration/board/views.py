@@ -11,12 +11,16 @@ from numpy.typing import NDArray
 from ...types import Float
 from .board import Board
 
+CAMERAS = ("color", "thermal", "depth")  # in this order the first that sees boards is the hub
 MIN_POINTS = 6  # below this a pose from one picture is not determined with any redundancy
 
 
 @dataclass(frozen=True, eq=False)
 class BoardPoints:
-    """Board points in one picture: `index` (N,) into `board.points_m`, `px` (N, 2), first pixel centre (0, 0)."""
+    """Board points in one picture: `index` (N,) into `board.points_m`, `px` (N, 2), first pixel centre (0, 0).
+
+    Points whose pixels are not finite are left out. Raises ValueError if the lengths differ.
+    """
 
     index: NDArray[np.int64]
     px: Float
@@ -47,7 +51,7 @@ class DepthSamples:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class BoardView:
     """One stand of the board: `points` by camera (`color`, `thermal`, `depth` for an infrared picture), depth on its
     plane, and the board's corners where the depth image's dropouts put them (their shift in common)."""
 
@@ -56,7 +60,7 @@ class View:
     depth: DepthSamples | None = None
     depth_marks: BoardPoints | None = None
 
-    def with_points(self, camera: str, points: BoardPoints | None) -> View:
+    def with_points(self, camera: str, points: BoardPoints | None) -> BoardView:
         """A copy with other points of one camera (None: without)."""
         kept = {k: v for k, v in self.points.items() if k != camera}
         return replace(self, points=kept if points is None else {**kept, camera: points})
@@ -71,17 +75,17 @@ class CalibrationSet:
 
     board: Board
     image_size: Mapping[str, tuple[int, int]]
-    views: tuple[View, ...]
+    views: tuple[BoardView, ...]
 
     def named(self, names: set[str]) -> CalibrationSet:
         """Only the views of these names."""
         return replace(self, views=tuple(v for v in self.views if v.name in names))
 
-    def seen_by(self, camera: str) -> list[View]:
+    def seen_by(self, camera: str) -> list[BoardView]:
         """Views in which a camera saw enough of the board."""
         return [v for v in self.views if camera in v.points and len(v.points[camera]) >= MIN_POINTS]
 
     @property
     def cameras(self) -> list[str]:
         """Cameras with pictures of the board, colour first."""
-        return [c for c in ("color", "thermal", "depth") if self.seen_by(c)]
+        return [c for c in CAMERAS if self.seen_by(c)]

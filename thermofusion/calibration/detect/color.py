@@ -9,13 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...types import Float
-from ..board.board import Board
+from ..board.board import ARUCO_DICTIONARY, Board
 from ..board.views import BoardPoints
 from .corners import refine_corners
 
-ARUCO_DICTIONARY = cv2.aruco.DICT_5X5_1000
 SB_FLAGS = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
-
 QUICK_PX = 480  # shorter side of the picture in which a board is looked for first
 
 
@@ -62,7 +60,7 @@ def _corners(grey: NDArray, size: tuple[int, int]) -> NDArray | None:
 
 
 def upright(grid: Float) -> Float:
-    """A detected grid (rows, columns, 2) renumbered so that it runs as seen from the front, rows rightwards.
+    """A detected grid (R, C, 2), px, renumbered so that it runs as seen from the front, rows rightwards.
 
     An unmarked board looks the same after half a turn (a square one after a quarter). All cameras of a rig hold their
     pictures upright, so the numbering nearest to upright is the same in all of them, unless the board was turned by

@@ -16,12 +16,14 @@ from ...types import Float
 WINDOW = 0.38  # radius of what is fitted, shorter square edges
 HIDDEN = 0.12  # ... and of the middle left out: a pin or a drill mark sits there
 MIN_RADIUS_PX, MAX_RADIUS_PX = 3.0, 14.0
-ITERATIONS = 12
+ITERATIONS = 12  # of Gauss-Newton; the best of them is kept
+PLACE, DIRECTIONS, SIGMA = slice(0, 2), slice(2, 4), slice(4, 5)  # of a crossing's five numbers: px, rad, px
 MAX_MOVE_PX = 1.5  # a crossing that runs farther from its detection has met something else
 
 
 def refine_corners(grey: NDArray, grid: Float) -> Float:
-    """Grid (rows, columns, 2) px of detected crossings, each moved to the best fit; where that fails, as it was.
+    """Detected crossings, `grid` (R, C, 2) px, in the picture `grey` (H, W), each moved to the best fit; where that
+    fails, as it was.
 
     Brightness about a crossing: a plane, plus a plane times E1·E2, with E = erf(d / (sqrt(2) sigma)) of the distance d
     to each edge. Unknown for each crossing: its place, two edge directions, sigma, and the six numbers of the planes.
@@ -47,8 +49,8 @@ def refine_corners(grey: NDArray, grid: Float) -> Float:
         better = now < error
         best[better], error[better] = shape[better], now[better]
         shape = shape + np.clip(step, [-1, -1, -0.2, -0.2, -0.3], [1, 1, 0.2, 0.2, 0.3])
-        shape[:, 4] = np.clip(shape[:, 4], 0.3, 0.5 * radius)
-    found = base + best[:, :2]
+        shape[:, SIGMA] = np.clip(shape[:, SIGMA], 0.3, 0.5 * radius)
+    found = base + best[:, PLACE]
     good = (np.linalg.norm(found - start, axis=1) < MAX_MOVE_PX)[:, None]
     return np.where(good, found, start).reshape(grid.shape)
 
@@ -56,10 +58,10 @@ def refine_corners(grey: NDArray, grid: Float) -> Float:
 def _step(shape: Float, values: Float, du: NDArray, dv: NDArray) -> tuple[Float, Float]:
     """Gauss-Newton step (N, 5) of place, edge directions and sigma, planes solved along; mean square misfit (N,)."""
     x, y = du - shape[:, :1], dv - shape[:, 1:2]
-    sigma = shape[:, 4:]
+    sigma = shape[:, SIGMA]
     E, slope, across, along = [], [], [], []
-    for k in (2, 3):
-        c, s = np.cos(shape[:, k : k + 1]), np.sin(shape[:, k : k + 1])
+    for angle in np.split(shape[:, DIRECTIONS], 2, axis=1):
+        c, s = np.cos(angle), np.sin(angle)
         d = -s * x + c * y
         E.append(erf(d / (np.sqrt(2) * sigma)))
         slope.append(np.sqrt(2 / np.pi) / sigma * np.exp(-0.5 * (d / sigma) ** 2))

@@ -13,8 +13,10 @@ from ..board.views import DepthSamples
 
 CELLS = 14  # cells across the longer side of the board
 MIN_PIXELS = 200  # fewer depth pixels on a board say nothing reliable
-MIN_CELLS = 8
-FIT_PIXELS = 3000
+MIN_CELLS = 8  # fewer cells leave tilt and distance of the plane to chance
+FIT_PIXELS = 3000  # of a board, evenly spread: the plane's three numbers need no more
+MIN_CORNER_M = 0.05  # along z: nearer to the pupil a pixel says nothing on where the corner is
+NO_DISPARITY = 2047  # a Kinect's eleven bits of 1: nothing was seen
 METRIC_NOISE = 1.5e-3  # m at 1 m, growing as range² (Kinect v1: Khoshelham & Elberink 2012 give 1.4e-3)
 QUANTUM_DISPARITY = 0.5  # counts
 CORRELATED_PIXELS = 9.0  # a structured-light camera's pixels are not independent within its matching window
@@ -25,21 +27,17 @@ def sample_board(
 ) -> DepthSamples | None:
     """Samples of one view, or None if the board shows too little depth.
 
-    image : (H, W) metres along z (NaN none) or raw disparity (0 or >= 2047 none). outline_m : (4, 3) board corners.
+    image : (H, W) m along z (NaN none) or raw disparity (0 or >= 2047 none). T_depth_board : (4, 4). outline_m : (4, 3)
+    board corners.
     On a plane 1/z (and a disparity) is an affine function of the pixel: what departs from the robust affine fit is
     another surface, a pin or a flying pixel.
     """
-    corners = outline_m @ T_depth_board[:3, :3].T + T_depth_board[:3, 3]
-    if (corners[:, 2] <= 0.05).any():
+    mask = _board_mask(image.shape, camera, outline_m @ T_depth_board[:3, :3].T + T_depth_board[:3, 3])
+    if mask is None:
         return None
-    polygon = project(camera, corners)[0]
-    if not np.isfinite(polygon).all():
-        return None
-    mask = np.zeros(image.shape, np.uint8)
-    cv2.fillConvexPoly(mask, np.round(polygon).astype(np.int32), 1)
     value = image.astype(np.float64)
-    valid = (value > 0) & (value < 2047) if disparity else np.isfinite(value) & (value > 0)
-    v, u = np.nonzero((mask > 0) & valid)
+    valid = (value > 0) & (value < NO_DISPARITY) if disparity else np.isfinite(value) & (value > 0)
+    v, u = np.nonzero(mask & valid)
     if len(u) < MIN_PIXELS:
         return None
     y = value[v, u] if disparity else 1 / value[v, u]
@@ -66,6 +64,18 @@ def sample_board(
     return DepthSamples(px, py, out, sigma / np.sqrt(np.maximum(count[full] / CORRELATED_PIXELS, 1)))
 
 
+def _board_mask(shape: tuple[int, ...], camera: Camera, corners_m: Float) -> NDArray[np.bool_] | None:
+    """Pixels of an image between projected corners (4, 3), or None if one is beyond the lens."""
+    if (corners_m[:, 2] <= MIN_CORNER_M).any():
+        return None
+    polygon = project(camera, corners_m)[0]
+    if not np.isfinite(polygon).all():
+        return None
+    mask = np.zeros(shape, np.uint8)
+    cv2.fillConvexPoly(mask, np.round(polygon).astype(np.int32), 1)
+    return mask > 0
+
+
 def _straightened(camera: Camera, u: Float, v: Float) -> tuple[Float, Float]:
     """Pixels as the same lens without distortion would have them: the plane's depth is taken along straight rays."""
     if not np.any(camera.distortion):
@@ -79,7 +89,7 @@ def _on_plane(u: NDArray, v: NDArray, y: Float) -> tuple[Float, NDArray, float]:
     """The robust affine fit at the pixels, those within 4 sigmas of it, and that sigma [unit of y]."""
     A = np.stack([u - u.mean(), v - v.mean(), np.ones(len(u))], axis=1).astype(np.float64)
     A[:, :2] /= max(np.ptp(u), np.ptp(v), 1)
-    some = slice(None, None, max(1, len(y) // FIT_PIXELS))  # a plane needs no more
+    some = slice(None, None, max(1, len(y) // FIT_PIXELS))
     a, b, weight = A[some], y[some], np.ones(len(y[some]))
     coefficients: NDArray = np.zeros(3)
     scale = 1.0

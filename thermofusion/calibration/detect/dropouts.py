@@ -17,9 +17,9 @@ from ...types import Camera, Float
 from ..board.board import Board
 from ..board.views import BoardPoints
 
-MIN_SHARE, MAX_SHARE = 0.05, 0.5  # of the board's pixels lost: less or more draws no squares
-MIN_CORRELATION = 0.25
-MIN_SQUARE_PX = 5.0
+MIN_LOST_SHARE, MAX_LOST_SHARE = 0.05, 0.5  # of the board's pixels: fewer or more draw no squares
+MIN_CORRELATION = 0.25  # of lost pixels with drawn squares, -1 to 1; what agrees less may do so by chance
+MIN_SQUARE_PX = 5.0  # smaller squares blur into each other over the camera's matching window
 MARK_SIGMA_PX = 0.8  # one sigma of a view's shift: the squares' dropouts are ragged by the matching window
 
 
@@ -33,7 +33,8 @@ class Dropout:
 
 
 def register_dropouts(image: NDArray, camera: Camera, T_depth_board: Float, board: Board) -> Dropout | None:
-    """Shift of one depth image (H, W, NaN or 0 = lost), or None where its dropouts draw no board."""
+    """Shift [px] of a depth `image` (H, W), NaN or 0 lost, from the board at `T_depth_board` (4, 4), or None where its
+    dropouts draw no board."""
     X = board.points_m
     P = camera.K @ (X @ T_depth_board[:3, :3].T + T_depth_board[:3, 3]).T
     px = (P[:2] / P[2]).T
@@ -54,7 +55,7 @@ def register_dropouts(image: NDArray, camera: Camera, T_depth_board: Float, boar
     lost = ~(np.isfinite(image) & (image > 0))
     region = lost[lo[1] - reach : hi[1] + reach, lo[0] - reach : hi[0] + reach].astype(np.float32)
     share = float(lost[lo[1] : hi[1], lo[0] : hi[0]][inside].mean())
-    if not MIN_SHARE < share < MAX_SHARE:
+    if not MIN_LOST_SHARE < share < MAX_LOST_SHARE:
         return None
     pattern = np.where(inside, (np.floor(x) + np.floor(y)) % 2, 0).astype(np.float32)
     pattern[inside] -= pattern[inside].mean()

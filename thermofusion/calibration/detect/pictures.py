@@ -12,7 +12,7 @@ GREEN, RED = (0, 200, 0), (230, 40, 40)
 
 
 def to_grey(image: NDArray) -> NDArray[np.uint8]:
-    """Any picture to 8-bit grey, 1st to 99th percentile; NaN black."""
+    """Any picture (H, W) or (H, W, 3) to 8-bit grey (H, W), 1st to 99th percentile; NaN black."""
     x = np.asarray(image, np.float32)
     if x.ndim == 3:
         x = x.mean(axis=2)
@@ -23,7 +23,8 @@ def to_grey(image: NDArray) -> NDArray[np.uint8]:
 def draw_points(
     image: NDArray, accepted_px: Float, rejected_px: Float | None = None, *, size: int = 6
 ) -> NDArray[np.uint8]:
-    """(H, W, 3) RGB: accepted points as green rings, rejected places as red crosses; small pictures are doubled."""
+    """`image` (H, W) as RGB (H, W, 3): `accepted_px` (N, 2) as green rings, `rejected_px` (M, 2) as red crosses; small
+    pictures are doubled."""
     factor = 2 if image.shape[1] <= 800 else 1
     grey = to_grey(image).repeat(factor, axis=0).repeat(factor, axis=1)
     out = np.repeat(grey[..., None], 3, axis=2)

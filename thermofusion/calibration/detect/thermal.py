@@ -17,12 +17,12 @@ from ...robust import mad_sigma
 from ...types import Float
 from ..board.views import BoardPoints
 
-SPOT_SIGMA_PX = 1.2
+SPOT_SIGMA_PX = 1.2  # a pin's image is hardly larger than the lens's blur
 MIN_SNR = 3.0  # of a point accepted by itself
 WEAK_SNR = 2.1  # of one that has the sign of its neighbours and lies where they say: noise does so in one of 20
 FIXED_PATTERN_VIEWS = 8  # pictures from which a sensor's own pattern can be told from the scene
-MIN_SHARE = 0.4  # of a board's points that make it found
-SATURATED_SHARE = 0.02
+MIN_FOUND_SHARE = 0.4  # of a board's points that make it found
+SATURATED_SHARE = 0.02  # of a picture's pixels on one end value: a scene within the range puts next to none there
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ def fixed_pattern(images: list[NDArray]) -> NDArray[np.float32] | None:
 
 
 def is_saturated(image: NDArray) -> bool:
-    """True if more than 2 % of the pixels sit on the highest or lowest value of the picture."""
+    """True if more than 2 % of the pixels of a picture (H, W) sit on its highest or lowest value."""
     lo, hi = image.min(), image.max()
     share = max(np.mean(image == lo), np.mean(image == hi))
     return bool(image.dtype.kind in "ui" and hi > lo and share > SATURATED_SHARE)
@@ -71,7 +71,8 @@ def is_saturated(image: NDArray) -> bool:
 def find_shift(
     spots: NDArray[np.float32], predicted: Float, reach_px: float, *, dilate_px: int = 2
 ) -> tuple[Float, float]:
-    """Shift (2,) px of a predicted grid (N, 2), within `reach_px`, at which most points lie on spots; mean score.
+    """Shift (2,) px of a `predicted` grid (N, 2), within `reach_px`, at which most points lie on `spots` (H, W); mean
+    score.
 
     The score of a point is its |SNR| capped at 6 within `dilate_px`: many fair points beat a few bright ones.
     """
@@ -93,7 +94,8 @@ def find_shift(
 def complete(spots: NDArray[np.float32], predicted: Float, *, tolerance_px: float | None = None) -> Detection:
     """Take each point's peak near its prediction, bend the grid, and again with a smaller window.
 
-    predicted : (N, 2) px of all board points, lens distortion included, wrong by up to half a step.
+    spots : (H, W) of `spot_map`. predicted : (N, 2) px of all board points, lens distortion included, wrong by up to
+    half a step.
     """
     step = step_px(predicted)
     limit = max(1.2, 0.05 * step) if tolerance_px is None else tolerance_px
@@ -117,14 +119,14 @@ def complete(spots: NDArray[np.float32], predicted: Float, *, tolerance_px: floa
     inlier = close & (snr > MIN_SNR)
     if inlier.sum() >= 8:
         inlier |= close & (snr > WEAK_SNR) & _like_neighbours(spots, q, peak, inlier)
-    if inlier.mean() < MIN_SHARE:
+    if inlier.mean() < MIN_FOUND_SHARE:
         inlier = np.zeros(len(q), bool)
     index = np.flatnonzero(inlier)
     return Detection(BoardPoints(index, peak[index]), q, inlier)
 
 
 def step_px(predicted: Float) -> float:
-    """Median distance of a point to its nearest neighbour."""
+    """Median distance of predicted points (N, 2) px to their nearest neighbour."""
     d = np.linalg.norm(predicted[:, None] - predicted[None], axis=2)
     np.fill_diagonal(d, np.inf)
     return float(np.median(d.min(axis=1)))

@@ -17,9 +17,23 @@ import scipy.sparse as sp
 
 from ...types import Float
 from ..board.views import BoardPoints, CalibrationSet
-from .cameras import INTRINSIC_NAMES, LensPrior, left_jacobians, project_with_jacobian, rotations, skew
+from .cameras import (
+    DISTORTION,
+    FOCAL,
+    INTRINSIC_NAMES,
+    PINHOLE,
+    SHIFT,
+    TURN,
+    LensPrior,
+    left_jacobians,
+    project_with_jacobian,
+    rotations,
+    skew,
+)
 from .depth_model import DepthModel
 
+# Parts of a row of a point's Jacobian: after the lens the board's pose, after `spacing` the extrinsic.
+POSE_COLUMNS, EXTRINSIC_COLUMNS = slice(9, 15), slice(16, 22)
 DEPTH_ASPECT = 0.003  # one sigma of ln(fx/fy) of a depth camera that is seen through planes only
 
 
@@ -116,10 +130,11 @@ class Problem:
         self.names += names
 
     def extrinsic_key(self, camera: str, group: int) -> str:
-        """Name of the block T_camera_hub; the thermal one has one per group."""
+        """Name of the block T_camera_hub; the thermal camera has one in each group."""
         return f"T_{camera}_{self.hub}" + (f"[{group}]" if camera == "thermal" else "")
 
     def extrinsic_keys(self) -> list[str]:
+        """Names of all blocks T_camera_hub, in the order of the unknowns."""
         others = [c for c in self.cameras if c != self.hub]
         if self.depth_model is not None and "depth" not in others:
             others.append("depth")
@@ -129,6 +144,10 @@ class Problem:
     def _columns(self, key: str) -> np.ndarray:
         s = self.slices[key]
         return np.arange(s.start, s.stop)
+
+    def _board_poses(self, x: Float) -> Float:
+        """(V, 6) of `to_rt` of all views, in units of the nominal spacing."""
+        return x[self.slices[f"view:{self.views[0].name}"].start :].reshape(len(self.views), 6)
 
     def _point_block(self, camera: str, points: Mapping[str, BoardPoints]) -> _PointBlock:
         board = self.data.board.points_m
@@ -165,29 +184,27 @@ class Problem:
     # ------------------------------------------------------------ residuals
 
     def point_residuals(self, block: _PointBlock, x: Float) -> tuple[Float, Float, np.ndarray]:
-        """(N, 2) projected minus seen [px], and the Jacobian's values and columns (N, 2, P)."""
-        scale = np.exp(x[self.slices["spacing"]][0])
+        """(N, 2) projected minus seen [px] at parameters x (P,); the Jacobian's values (N, 2, 16 or 22) and columns."""
+        scale, pose = np.exp(x[self.slices["spacing"]][0]), self._board_poses(x)
         X = block.board
-        n_views = len(self.views)
-        board_pose = x[self.slices[f"view:{self.views[0].name}"].start :].reshape(n_views, 6)
-        Rv, Jv = rotations(board_pose[:, :3]), left_jacobians(board_pose[:, :3])
+        Rv, Jv = rotations(pose[:, TURN]), left_jacobians(pose[:, TURN])
         RX = np.einsum("nij,nj->ni", Rv[block.view], X)
-        p = scale * (RX + board_pose[block.view, 3:])
+        p = scale * (RX + pose[block.view, SHIFT])
         if block.extrinsic is None:
             q, Rc = p, None
         else:
             keys, which = np.unique(block.extrinsic[:, 0], return_inverse=True)
             rt = np.stack([x[k : k + 6] for k in keys])
-            Re, Je = rotations(rt[:, :3]), left_jacobians(rt[:, :3])
+            Re, Je = rotations(rt[:, TURN]), left_jacobians(rt[:, TURN])
             Rc = Re[which]
             Rp = np.einsum("nij,nj->ni", Rc, p)
-            q = Rp + rt[which, 3:]
+            q = Rp + rt[which, SHIFT]
         uv, J, D = project_with_jacobian(q, x[block.lens])
         Jp = J if Rc is None else J @ Rc
         parts = [D, -scale * Jp @ skew(RX) @ Jv[block.view], scale * Jp, np.einsum("nij,nj->ni", Jp, p)[..., None]]
         n = len(X)
         columns = [
-            np.broadcast_to(np.arange(block.lens.start, block.lens.stop), (n, 9)),
+            np.broadcast_to(np.arange(block.lens.start, block.lens.stop), (n, len(INTRINSIC_NAMES))),
             block.pose,
             np.full((n, 1), self.slices["spacing"].start),
         ]
@@ -197,38 +214,16 @@ class Problem:
         return uv - block.px, np.concatenate(parts, axis=2), np.concatenate(columns, axis=1)
 
     def depth_residuals(self, block: _DepthBlock, x: Float) -> tuple[Float, Float, np.ndarray]:
-        """(N,) corrected depth minus the plane's, in sigmas, and the Jacobian's values and columns (N, P)."""
+        """(N,) corrected depth minus the plane's, in sigmas, at parameters x (P,); Jacobian values and columns."""
         assert self.depth_model is not None
-        fx, fy, cx, cy = x[block.lens][:4]
-        r = np.stack([(block.u - cx) / fx, (block.v - cy) / fy, np.ones(len(block.u))], axis=1)
-        rt_d = x[block.extrinsic[0]]
-        Rd, Jd = rotations(rt_d[None, :3])[0], left_jacobians(rt_d[None, :3])[0]
-        first = self.slices[f"view:{self.views[0].name}"].start
-        pose = x[first:].reshape(len(self.views), 6)
-        n_h, Jv = rotations(pose[:, :3])[:, :, 2], left_jacobians(pose[:, :3])
-        scale = np.exp(x[self.slices["spacing"]][0])
-        n_d, q_d = (
-            n_h @ Rd.T,
-            scale * pose[:, 3:] @ Rd.T,
-        )  # normal and (before translation) origin of the board, depth axes
-        n, q, i = n_d[block.view], q_d[block.view], block.view
-        p0 = q + rt_d[3:]
-        den = np.einsum("ni,ni->n", n, r)
-        z = np.einsum("ni,ni->n", n, p0) / den
-        m = p0 - z[:, None] * r
-        dz_dwd = (np.cross(n, m) + np.cross(q, n)) @ Jd
-        dz_dwv = np.einsum("ni,nij->nj", np.cross(n_h[i], m @ Rd), Jv[i])
-        dz_dlens = np.zeros((len(z), 4))
-        dz_dlens[:, 0], dz_dlens[:, 1] = z * n[:, 0] * r[:, 0] / fx, z * n[:, 1] * r[:, 1] / fy
-        dz_dlens[:, 2], dz_dlens[:, 3] = z * n[:, 0] / fx, z * n[:, 1] / fy
-        dz_ds = np.einsum("ni,ni->n", n, q)[:, None]
-        dz = np.concatenate([dz_dlens, dz_dwd, n, dz_dwv, scale * n @ Rd, dz_ds], axis=1) / den[:, None]
+        z, dz = self._plane_depth(block, x)
         e, J_theta, e_z = self.depth_model.residual(x[block.theta], block.value, block.u, block.v, z)
         J = np.concatenate([e_z[:, None] * dz, J_theta], axis=1) / block.sigma[:, None]
         k = len(z)
+        lens = np.arange(block.lens.start, block.lens.stop)[PINHOLE]
         columns = np.concatenate(
             [
-                np.broadcast_to(np.arange(block.lens.start, block.lens.start + 4), (k, 4)),
+                np.broadcast_to(lens, (k, len(lens))),
                 block.extrinsic,
                 block.pose,
                 np.full((k, 1), self.slices["spacing"].start),
@@ -238,8 +233,33 @@ class Problem:
         )
         return e / block.sigma, J, columns
 
+    def _plane_depth(self, block: _DepthBlock, x: Float) -> tuple[Float, Float]:
+        """(N,) m along z of the board's plane on each sample's ray, and its derivatives (N, 17) by fx, fy, cx, cy, the
+        extrinsic, the board's pose and `spacing`."""
+        fx, fy, cx, cy = x[block.lens][PINHOLE]
+        r = np.stack([(block.u - cx) / fx, (block.v - cy) / fy, np.ones(len(block.u))], axis=1)
+        rt_d = x[block.extrinsic[0]]
+        Rd, Jd = rotations(rt_d[None, TURN])[0], left_jacobians(rt_d[None, TURN])[0]
+        pose = self._board_poses(x)
+        n_h, Jv = rotations(pose[:, TURN])[:, :, 2], left_jacobians(pose[:, TURN])
+        scale = np.exp(x[self.slices["spacing"]][0])
+        # normal and (before translation) origin of the board, depth axes
+        n_d, q_d = n_h @ Rd.T, scale * pose[:, SHIFT] @ Rd.T
+        n, q, i = n_d[block.view], q_d[block.view], block.view
+        p0 = q + rt_d[SHIFT]
+        den = np.einsum("ni,ni->n", n, r)
+        z = np.einsum("ni,ni->n", n, p0) / den
+        m = p0 - z[:, None] * r
+        dz_dwd = (np.cross(n, m) + np.cross(q, n)) @ Jd
+        dz_dwv = np.einsum("ni,nij->nj", np.cross(n_h[i], m @ Rd), Jv[i])
+        dz_dlens = np.zeros((len(z), 4))
+        dz_dlens[:, 0], dz_dlens[:, 1] = z * n[:, 0] * r[:, 0] / fx, z * n[:, 1] * r[:, 1] / fy
+        dz_dlens[:, 2], dz_dlens[:, 3] = z * n[:, 0] / fx, z * n[:, 1] / fy
+        dz_ds = np.einsum("ni,ni->n", n, q)[:, None]
+        return z, np.concatenate([dz_dlens, dz_dwd, n, dz_dwv, scale * n @ Rd, dz_ds], axis=1) / den[:, None]
+
     def priors(self, options: Options) -> tuple[np.ndarray, Float, Float]:
-        """Columns, means and sigmas of all beliefs that are linear in one parameter."""
+        """Columns (K,), means and sigmas, in the parameters' units, of all beliefs that are linear in one parameter."""
         found: dict[str, tuple[float, float]] = {}
         lens = options.lens
         for c in {*self.cameras, *(["depth"] if self.depth_model is not None else [])}:
@@ -266,12 +286,12 @@ class Problem:
         free = np.array([not held(n) for n in self.names])
         if self.depth_model is not None and "depth" not in self.cameras:
             # planes alone say next to nothing on the depth lens's distortion: the spatial field takes it up
-            free[self.slices["depth"].start + 4 : self.slices["depth"].stop] = False
+            free[self._columns("depth")[DISTORTION]] = False
         return free
 
     def weights(self, x: Float, options: Options, sigmas: float) -> Float:
-        """(M,) Huber weights of all data residuals: 1 within `sigmas`, then falling as 1/distance; by point, not by
-        coordinate."""
+        """(M,) Huber weights of all data residuals at parameters x (P,): 1 within `sigmas`, then falling as 1/distance;
+        by point, not by coordinate."""
         parts = []
         for block in self.points:
             r = np.linalg.norm(self.point_residuals(block, x)[0], axis=1) / options.sigma.get(block.camera, 0.5)
@@ -282,7 +302,8 @@ class Problem:
         return np.concatenate(parts)
 
     def linearise(self, x: Float, options: Options, weight: Float | None = None) -> tuple[Float, sp.csr_matrix]:
-        """Whitened residuals (M,) of data and priors, and their Jacobian (M, P); data rows times sqrt(weight)."""
+        """Whitened residuals (M,) of data and priors at parameters x (P,), and their Jacobian (M, P); data's rows times
+        the root of `weight` (D,)."""
         residuals, values, columns, rows, start = [], [], [], [], 0
 
         def put(e: Float, J: Float, c: np.ndarray) -> None:
@@ -305,13 +326,10 @@ class Problem:
         column, mean, sigma = self.priors(options)
         put((x[column] - mean) / sigma, 1 / sigma[:, None], column[:, None])
         for lens in sorted({*self.cameras, "depth"} & self.slices.keys()):  # fx and fy of one lens are nearly equal
-            f = self.slices[lens].start
+            focal = self._columns(lens)[FOCAL]
+            fx, fy = x[focal]
             s = options.lens.aspect if lens in self.cameras else DEPTH_ASPECT
-            put(
-                np.array([np.log(x[f] / x[f + 1]) / s]),
-                np.array([[1 / x[f], -1 / x[f + 1]]]) / s,
-                np.array([[f, f + 1]]),
-            )
+            put(np.array([np.log(fx / fy) / s]), np.array([[1 / fx, -1 / fy]]) / s, focal[None])
         shape = (start, len(self.names))
         J_all = sp.csr_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=shape)
         e_all = np.concatenate(residuals)

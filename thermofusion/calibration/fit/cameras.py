@@ -14,6 +14,8 @@ from scipy.spatial.transform import Rotation
 from ...types import Camera, Float
 
 INTRINSIC_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+FOCAL, PINHOLE, DISTORTION = slice(0, 2), slice(0, 4), slice(4, 9)  # parts of the intrinsics
+TURN, SHIFT = slice(0, 3), slice(3, 6)  # parts of `to_rt`: rotation vector [rad], translation [m]
 
 
 @dataclass(frozen=True)
@@ -32,21 +34,26 @@ class LensPrior:
 
 
 def intrinsics_of(camera: Camera) -> Float:
-    """(9,) vector of a camera without rational terms. Raises ValueError otherwise."""
+    """(9,) vector of a camera without rational terms, px and none. Raises ValueError otherwise."""
     if len(camera.distortion) != 5:
         raise ValueError("the fit knows five distortion terms, not the rational form")
     K = camera.K
     return np.concatenate([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], camera.distortion])
 
 
-def camera_of(intrinsics: Float, size: tuple[int, int]) -> Camera:
-    """A `Camera` from the vector; size = (width, height)."""
-    fx, fy, cx, cy = intrinsics[:4]
-    return Camera(size[0], size[1], np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), np.array(intrinsics[4:9]))
+def camera_with(intrinsics: Float, size: tuple[int, int]) -> Camera:
+    """A `Camera` with intrinsics (9,); size = (width, height), px."""
+    return Camera(size[0], size[1], matrix(intrinsics), np.array(intrinsics[DISTORTION]))
+
+
+def matrix(intrinsics: Float) -> Float:
+    """K (3, 3) of intrinsics (9,), px."""
+    fx, fy, cx, cy = intrinsics[PINHOLE]
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
 
 def project_with_jacobian(points: Float, intrinsics: Float) -> tuple[Float, Float, Float]:
-    """Pixels (N, 2) of points (N, 3) in the camera's frame, d px/d point (N, 2, 3) and d px/d intrinsics (N, 2, 9).
+    """Pixels (N, 2) of points (N, 3), m, in the camera's frame, d px/d point (N, 2, 3) and d px/d intrinsics (N, 2, 9).
 
     The paper's Eqs. 4-8 in OpenCV's coefficient order.
     """
@@ -69,18 +76,19 @@ def project_with_jacobian(points: Float, intrinsics: Float) -> tuple[Float, Floa
     J[:, :, 2] = -(J[:, :, 0] * x[:, None] + J[:, :, 1] * y[:, None])
     D = np.zeros((len(points), 2, 9))
     D[:, 0, 0], D[:, 1, 1], D[:, 0, 2], D[:, 1, 3] = x_d, y_d, 1, 1
-    D[:, 0, 4:9] = fx * np.stack([x * r2, x * r2**2, 2 * xy, r2 + 2 * x * x, x * r2**3], axis=1)
-    D[:, 1, 4:9] = fy * np.stack([y * r2, y * r2**2, r2 + 2 * y * y, 2 * xy, y * r2**3], axis=1)
+    D[:, 0, DISTORTION] = fx * np.stack([x * r2, x * r2**2, 2 * xy, r2 + 2 * x * x, x * r2**3], axis=1)
+    D[:, 1, DISTORTION] = fy * np.stack([y * r2, y * r2**2, r2 + 2 * y * y, 2 * xy, y * r2**3], axis=1)
     return uv, J, D
 
 
 def rotations(w: Float) -> Float:
-    """(N, 3, 3) matrices of rotation vectors (N, 3)."""
+    """(N, 3, 3) matrices of rotation vectors (N, 3), rad."""
     return Rotation.from_rotvec(w).as_matrix()
 
 
 def left_jacobians(w: Float) -> Float:
-    """(N, 3, 3) J with R(w + dw) = exp([J dw]x) R(w) to first order (Barfoot, State Estimation for Robotics, 7.77)."""
+    """(N, 3, 3) J of rotation vectors (N, 3), rad, with R(w + dw) = exp([J dw]x) R(w) to first order
+    (Barfoot, State Estimation for Robotics, 7.77)."""
     theta = np.linalg.norm(w, axis=1)[:, None, None]
     W = skew(w)
     safe = np.maximum(theta, 1e-8)
@@ -90,7 +98,7 @@ def left_jacobians(w: Float) -> Float:
 
 
 def skew(w: Float) -> Float:
-    """(..., 3) to the matrices of the cross product (..., 3, 3)."""
+    """Vectors (..., 3), any unit, to the matrices of the cross product (..., 3, 3)."""
     W = np.zeros((*w.shape[:-1], 3, 3))
     W[..., 0, 1], W[..., 0, 2], W[..., 1, 2] = -w[..., 2], w[..., 1], -w[..., 0]
     return W - np.swapaxes(W, -1, -2)
@@ -104,10 +112,10 @@ def to_rt(T: Float) -> Float:
 
 
 def from_rt(rt: NDArray) -> Float:
-    """Inverse of `to_rt`."""
+    """Inverse of `to_rt`: (..., 6), rad and m, to (..., 4, 4)."""
     rt = np.asarray(rt, np.float64)
     T = np.zeros((*rt.shape[:-1], 4, 4))
-    T[..., :3, :3] = Rotation.from_rotvec(rt[..., :3].reshape(-1, 3)).as_matrix().reshape(*rt.shape[:-1], 3, 3)
-    T[..., :3, 3] = rt[..., 3:]
+    T[..., :3, :3] = Rotation.from_rotvec(rt[..., TURN].reshape(-1, 3)).as_matrix().reshape(*rt.shape[:-1], 3, 3)
+    T[..., :3, 3] = rt[..., SHIFT]
     T[..., 3, 3] = 1.0
     return T

@@ -9,11 +9,11 @@ import numpy as np
 from ...types import Float
 from .rig import Calibration
 
-GRID = 3
+GRID = 3  # parts of a picture each way
 ROWS, COLUMNS = ("upper", "middle", "lower"), ("left", "centre", "right")
-MIN_TILT_DEG = 12.0
-ENOUGH_VIEWS = 15
-MIN_DISTANCE_RATIO = 1.4
+MIN_TILT_DEG = 12.0  # to each side: boards more upright leave focal length and distance interchangeable
+ENOUGH_VIEWS = 15  # docs/calibration.md asks for 15 to 30
+MIN_DISTANCE_RATIO = 1.4  # farthest to nearest board: a depth error that grows with range shows over some range only
 
 
 @dataclass(frozen=True, eq=False)

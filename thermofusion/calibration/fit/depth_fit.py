@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from ..board.views import CalibrationSet
 from ..detect.depth_samples import sample_board
 from ..detect.dropouts import MARK_SIGMA_PX, agreeing, register_dropouts
 from .bundle import Options, Problem
-from .cameras import intrinsics_of, to_rt
+from .cameras import camera_with, from_rt, intrinsics_of, to_rt
 from .depth_model import DepthModel, DisparityDepth
 from .joint import lens_priors, plausible
 from .mirror import fits_unmirrored, refuse_mirrored_depth
@@ -26,60 +26,114 @@ from .solver import Fit, solve
 # each other; boards alone trade that distance against the depth scale.
 DEPTH_PLACE_M = (0.1, 0.1, 0.015)
 PLANE_FLOOR = 2.5e-5  # m at 1 m: no depth camera is truer than this over a whole plane, however many pixels it averages
-MIN_MARKED_VIEWS = 4
+MIN_MARKED_VIEWS = 4  # fewer drawings of dropouts do not outvote one that was matched a square off
+UNSURE_SPACINGS = -0.1  # the board's margin while the depth camera's place is a guess: the rim may lie beside the board
+MAX_TURNS = 3  # the third only where the second found the board drawn by dropouts
 KINECT_FOCAL = 585.0 / 640.0  # image widths; structured-light and many time-of-flight cameras lie near it
 
 DepthImages = Mapping[str, Callable[[], NDArray]]
 
 
+@dataclass(frozen=True, eq=False)
+class DepthStart:
+    """What the fit of the depth camera starts from.
+
+    images : view name -> loader of (H, W), m along z (NaN none), or raw disparity for DisparityDepth. model : of their
+    error. sheet : the camera's data sheet, None if nobody knows it; with `lens_known` the maker's calibration of this
+    very camera, which is held. T_guess : (4, 4) first guess of T_depth_hub. free_spacing : the boards' spacing is
+    unknown, and depth true in scale. lens, T_depth_hub (4, 4) : lens and place as known so far.
+    """
+
+    images: DepthImages
+    model: DepthModel
+    sheet: Camera | None
+    lens_known: bool
+    T_guess: Float
+    free_spacing: bool
+    lens: Camera
+    T_depth_hub: Float
+
+    def at(self, fit: Fit) -> DepthStart:
+        """With lens and place as a fit found them."""
+        lens = camera_with(fit.block("depth"), self.model.size)
+        return replace(self, lens=lens, T_depth_hub=from_rt(fit.block(f"T_depth_{fit.problem.hub}")))
+
+
+def add_depth(points: Fit, single: dict[str, SingleFit], start: DepthStart) -> tuple[Fit, list[str]]:
+    """Depth on top of the point cameras' fit, in turns: each knows better where the boards lie in the depth images.
+
+    Raises ScanError: pictures of another size, mirrored depth images, no board in them.
+    """
+    data, size = points.problem.data, start.model.size
+    if data.image_size.get("depth", size) != size:
+        raise ScanError(
+            "the infrared pictures are {} x {} px, the depth images {} x {}".format(*data.image_size["depth"], *size),
+            hint="crop them to the same pixels: both must be one camera's",
+        )
+    margin = UNSURE_SPACINGS
+    if "depth" in single:  # infrared pictures say where the depth camera is
+        seen, margin = start.at(points), 0.0
+        start = replace(seen, lens=start.lens) if start.lens_known else seen
+    if not isinstance(start.model, DisparityDepth):
+        check_depth_orientation(points, start)
+    fit, notes = points, list[str]()
+    for turn in range(MAX_TURNS):
+        scale = float(np.exp(fit.block("spacing")[0]))
+        sampled = with_depth(data, start, fit.board_poses(), margin, scale)
+        fit, notes = fit_with_depth(points, sampled, single, start)
+        start, margin = start.at(fit), 0.0
+        if turn == 1 and not any(v.depth_marks for v in sampled.views):
+            break
+    return fit, notes
+
+
 def fit_with_depth(
-    fit: Fit,
-    data: CalibrationSet,
-    single: dict[str, SingleFit],
-    groups: dict[str, int] | None,
-    model: DepthModel,
-    depth_camera: Camera,
-    T_depth_hub: Float,
-    T_guess: Float,
-    free_spacing: bool,
-    depth_lens_known: bool,
+    points: Fit, data: CalibrationSet, single: dict[str, SingleFit], start: DepthStart
 ) -> tuple[Fit, list[str]]:
     """Depth planes on top of the point cameras' fit: first alone against held boards, which shows how far whole planes
-    miss; then everything together with that as their weight."""
-    size = (depth_camera.width_px, depth_camera.height_px)
-    problem = Problem(data, groups=groups, depth_model=model, depth_size=size)
+    miss; then everything together with that as their weight.
+
+    Raises ScanError if no depth image shows a board.
+    """
+    before, camera = points.problem, start.sheet or start.lens
+    groups = dict(zip((v.name for v in before.views), before.group.tolist(), strict=True))
+    problem = Problem(data, groups=groups, depth_model=start.model, depth_size=start.model.size)
     if problem.depth is None:
         raise ScanError(
             "no depth image shows the board's plane",
             hint="give a first guess of T_depth_color, or check the depth unit",
         )
-    x = np.zeros(len(problem.names))
-    for key, s in fit.problem.slices.items():
-        x[problem.slices[key]] = fit.x[s]
     key = f"T_depth_{problem.hub}"
-    if "depth" not in fit.problem.slices:
-        x[problem.slices["depth"]] = intrinsics_of(depth_camera)
-        x[problem.slices[key]] = to_rt(T_depth_hub)
-    if depth_lens_known:
-        x[problem.slices["depth"]] = intrinsics_of(depth_camera)
-    x[problem.slices["depth_model"]] = model.start()
-    fixed = set(fit.options.fixed) - {"spacing"}
-    fixed |= {"depth_model"} if free_spacing else {"spacing"}
-    if depth_lens_known:
+    fixed = set(points.options.fixed) - {"spacing"} | {"depth_model" if start.free_spacing else "spacing"}
+    if start.lens_known:
         fixed.add("depth")
-    held = frozenset(fixed | {k for k in fit.problem.slices if k not in ("spacing", "depth", key)})
-    priors = lens_priors(single, problem, depth_camera)
+    held = frozenset(fixed | {k for k in before.slices if k not in ("spacing", "depth", key)})
+    priors = lens_priors(single, problem, camera)
     if "depth" not in single:
-        place = zip("xyz", T_guess[:3, 3], DEPTH_PLACE_M, strict=True)
+        place = zip("xyz", start.T_guess[:3, 3], DEPTH_PLACE_M, strict=True)
         priors |= {f"{key}.t{axis}": (float(m), e) for axis, m, e in place}
     marks = MARK_SIGMA_PX * 2.0  # four corners share one measured shift
-    options = Options(fixed=held, priors=priors, sigma={"depth": marks, **fit.options.sigma})
+    options = Options(fixed=held, priors=priors, sigma={"depth": marks, **points.options.sigma})
+    x = _depth_guess(problem, points, camera, start)
     for _ in range(2):
         alone = solve(problem, x, options)
         x = alone.x
-        options = replace(options, sigma={**options.sigma, "depth_plane": _depth_sigma(alone, fit)})
+        options = replace(options, sigma={**options.sigma, "depth_plane": _depth_sigma(alone, points)})
     joint = solve(problem, x, replace(options, fixed=frozenset(fixed)))
     return plausible(joint, single)
+
+
+def _depth_guess(problem: Problem, points: Fit, camera: Camera, start: DepthStart) -> Float:
+    """(P,) start of the fit with depth: what the point cameras' fit found, and the depth camera as known so far."""
+    x = np.zeros(len(problem.names))
+    for key, s in points.problem.slices.items():
+        x[problem.slices[key]] = points.x[s]
+    if "depth" not in points.problem.slices:
+        x[problem.slices[f"T_depth_{problem.hub}"]] = to_rt(start.T_depth_hub)
+    if "depth" not in points.problem.slices or start.lens_known:
+        x[problem.slices["depth"]] = intrinsics_of(camera)
+    x[problem.slices["depth_model"]] = start.model.start()
+    return x
 
 
 def _depth_sigma(alone: Fit, points: Fit) -> float:
@@ -108,36 +162,25 @@ def _depth_sigma(alone: Fit, points: Fit) -> float:
 
 
 def with_depth(
-    data: CalibrationSet,
-    images: DepthImages,
-    camera: Camera,
-    T_depth_hub: Float,
-    poses: dict[str, Float],
-    kind: str,
-    margin: float,
-    scale: float = 1.0,
+    data: CalibrationSet, start: DepthStart, poses: Mapping[str, Float], margin: float, scale: float = 1.0
 ) -> CalibrationSet:
     """The set with depth samples on each board, and where dropouts draw it.
 
-    poses : T_hub_board by view, metres. margin : spacings by which the board is taken larger than its points. scale :
-    of the board's nominal spacing, as found so far.
+    poses : T_hub_board (4, 4) by view, m. margin : spacings by which the board is taken larger than its points. scale :
+    of the board's nominal spacing, as found so far. Raises ScanError if an image is of another size than the camera.
     """
-    board = replace(data.board, spacing_m=data.board.spacing_m * scale)
+    board, disparity = (
+        replace(data.board, spacing_m=data.board.spacing_m * scale),
+        isinstance(start.model, DisparityDepth),
+    )
     outline = board.outline_m(margin)
     views, found = [], {}
     for view in data.views:
         samples = None
-        if view.name in images and view.name in poses:
-            image = images[view.name]()
-            if image.shape != camera.shape:
-                raise ScanError(
-                    f"the depth image is {image.shape[1]} x {image.shape[0]} px, the camera {camera.width_px} x "
-                    f"{camera.height_px}",
-                    place=view.name,
-                )
-            T_depth_board = T_depth_hub @ poses[view.name]
-            samples = sample_board(image, camera, T_depth_board, outline, disparity=kind == "disparity")
-            dropout = register_dropouts(image, camera, T_depth_board, board) if margin >= 0 else None
+        if view.name in start.images and view.name in poses:
+            image, T_depth_board = _image(start, view.name), start.T_depth_hub @ poses[view.name]
+            samples = sample_board(image, start.lens, T_depth_board, outline, disparity=disparity)
+            dropout = register_dropouts(image, start.lens, T_depth_board, board) if margin >= 0 else None
             if dropout is not None and data.board.kind in ("pins", "checkerboard"):
                 found[view.name] = dropout
         views.append(replace(view, depth=samples))
@@ -148,26 +191,35 @@ def with_depth(
     )
 
 
-def check_depth_orientation(data: CalibrationSet, images: DepthImages, lens: Camera, T: Float, fit: Fit) -> None:
-    """Board normals in the depth images, as they are and if need be flipped, against the pictures' boards."""
-    poses = fit.board_poses()
-    plain = _depth_normals(with_depth(data, images, lens, T, poses, "metric", -0.1), lens, poses)
+def _image(start: DepthStart, name: str) -> NDArray:
+    image, lens = start.images[name](), start.lens
+    if image.shape != lens.shape:
+        raise ScanError(
+            f"the depth image is {image.shape[1]} x {image.shape[0]} px, the camera {lens.width_px} x {lens.height_px}",
+            place=name,
+        )
+    return image
+
+
+def check_depth_orientation(points: Fit, start: DepthStart) -> None:
+    """Raises ScanError if board normals in the depth images fit the pictures' boards only when those are flipped."""
+    plain = _depth_normals(points, start)
     if fits_unmirrored(plain):
         return
-    flipped: DepthImages = {n: (lambda load=load: load()[:, ::-1]) for n, load in images.items()}  # type: ignore[misc]
-    refuse_mirrored_depth(plain, _depth_normals(with_depth(data, flipped, lens, T, poses, "metric", -0.1), lens, poses))
+    flipped: DepthImages = {n: (lambda load=load: load()[:, ::-1]) for n, load in start.images.items()}  # type: ignore[misc]
+    refuse_mirrored_depth(plain, _depth_normals(points, replace(start, images=flipped)))
 
 
-def _depth_normals(data: CalibrationSet, lens: Camera, poses: dict[str, Float]) -> tuple[Float, Float]:
+def _depth_normals(points: Fit, start: DepthStart) -> tuple[Float, Float]:
     """(N, 3) unit normals of the boards as the pictures have them, and of planes through the depth samples."""
-    a, b, K = [], [], lens.K
-    for view in data.views:
+    a, b, K, poses = [], [], start.lens.K, points.board_poses()
+    for view in with_depth(points.problem.data, start, poses, UNSURE_SPACINGS).views:
         if view.depth is None or view.name not in poses:
             continue
         d = view.depth
         x = np.stack([(d.u_px - K[0, 2]) / K[0, 0], (d.v_px - K[1, 2]) / K[1, 1], np.ones(len(d))], axis=1)
-        points = x * d.value[:, None]
-        n = np.linalg.svd(points - points.mean(0), full_matrices=False)[2][2]
+        X = x * d.value[:, None]
+        n = np.linalg.svd(X - X.mean(0), full_matrices=False)[2][2]
         a.append(poses[view.name][:3, 2])
         b.append(n * np.sign(n[2]))
     return np.array(a).reshape(-1, 3), np.array(b).reshape(-1, 3)

@@ -18,6 +18,7 @@ from ...scans.native.depth_correction import FIELD_SHAPE, MetricDepth, field_bas
 from ...types import Float
 
 MIDDLE_DISPARITY = 750.0  # counts; some 1.05 m for a Kinect v1
+LINEAR, FIELD = slice(0, 3), slice(3, None)  # parts of the parameters: c0 [1/m], c1 [1/(m count)], decay; D [counts]
 
 
 @dataclass(frozen=True)
@@ -38,19 +39,24 @@ class DisparityDepth:
     )
 
     def start(self) -> Float:
+        """(P,) c0 [1/m], c1 [1/(m count)], decay [1/count] and field [counts] of a Kinect v1 that does not bend."""
         return np.array([self.c0, self.c1, self.decay] + [0.0] * (len(self.names) - 3))
 
     def prior_sigma(self) -> Float:
+        """(P,) one sigma of the parameters about `start`: how far one Kinect is from another."""
         return np.array([0.15, 1.5e-4, 0.001] + [self.sigma_field] * (len(self.names) - 3))
 
     def residual(
         self, theta: Float, value: Float, u_px: Float, v_px: Float, z_plane: Float
     ) -> tuple[Float, Float, Float]:
-        """(N,) undistorted disparity minus the plane's [counts], its derivatives by theta (N, P) and z_plane (N,)."""
-        c0, c1, decay = theta[:3]
+        """(N,) undistorted disparity minus the plane's [counts], its derivatives by theta (N, P) and z_plane (N,).
+
+        theta : (P,). value : (N,) raw disparity at u_px, v_px (N,). z_plane : (N,) m.
+        """
+        c0, c1, decay = theta[LINEAR]
         B = field_basis(u_px, v_px, self.size)
         damp = np.exp(-decay * (value - MIDDLE_DISPARITY))
-        bend = B @ theta[3:]
+        bend = B @ theta[FIELD]
         plane = (1 / z_plane - c0) / c1
         J = np.concatenate(
             [
@@ -64,16 +70,20 @@ class DisparityDepth:
         return value + bend * damp - plane, J, 1 / (c1 * z_plane**2)
 
     def to_depth_m(self, theta: Float, value: NDArray, u_px: NDArray, v_px: NDArray) -> Float:
-        """Depth along z of raw disparity (N,), metres."""
-        d = np.asarray(value, np.float64)
-        bend = field_basis(u_px, v_px, self.size) @ theta[3:]
-        d_u = d + bend * np.exp(-theta[2] * (d - MIDDLE_DISPARITY))
-        return 1 / (theta[1] * d_u + theta[0])
+        """Depth (N,) along z, m, of raw disparity `value` (N,) at u_px, v_px (N,), by parameters theta (P,)."""
+        (c0, c1, decay), d = theta[LINEAR], np.asarray(value, np.float64)
+        bend = field_basis(u_px, v_px, self.size) @ theta[FIELD]
+        d_u = d + bend * np.exp(-decay * (d - MIDDLE_DISPARITY))
+        return 1 / (c1 * d_u + c0)
 
     def to_disparity(self, theta: Float, z_m: NDArray, u_px: NDArray, v_px: NDArray) -> Float:
-        """Inverse of `to_depth_m`: the disparity (N,) the camera would report, by Lambert's W (Herrera Eq. 8)."""
-        d_u = (1 / np.asarray(z_m, np.float64) - theta[0]) / theta[1]
-        bend, decay = field_basis(u_px, v_px, self.size) @ theta[3:], theta[2]
+        """Inverse of `to_depth_m`: the disparity (N,) the camera would report, by Lambert's W (Herrera Eq. 8).
+
+        theta : (P,). z_m, u_px, v_px : (N,).
+        """
+        c0, c1, decay = theta[LINEAR]
+        d_u = (1 / np.asarray(z_m, np.float64) - c0) / c1
+        bend = field_basis(u_px, v_px, self.size) @ theta[FIELD]
         bend = bend * np.exp(decay * MIDDLE_DISPARITY)
         # d + B e^(-a d) = d_u. With y = a (d_u - d): y e^(-y)... solved as d = d_u + W(-a B e^(-a d_u)) / a
         return d_u + np.real(lambertw(-decay * bend * np.exp(-decay * d_u))) / decay

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...types import Float
-from .bundle import Problem
+from .bundle import EXTRINSIC_COLUMNS, POSE_COLUMNS, Problem
 
 MIN_RUN = 3  # a state of the rig needs this many views to be told from an error in one
 SPLIT_GAIN = 0.6  # one more run must lower the mean square prediction error to this share
 OUTLIER_FACTOR = 2.5  # a view predicted this much worse than the median view of its run is named
 OUTLIER_FLOOR_PX = 1.0  # ... but never for less than this, beyond the picking noise
-MAX_RUNS = 6
+MAX_RUNS = 6  # a rig that moved more often was not fixed at all
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +32,7 @@ class Misfits:
     H: Float  # (V, 6, 6)
 
     def at(self, v: int, x: Float) -> float:
+        """px² of view v at a change x (6,) of the extrinsic, rad and m."""
         return float(self.c[v] + 2 * self.g[v] @ x + x @ self.H[v] @ x)
 
 
@@ -39,15 +40,15 @@ class Misfits:
 class Grouping:
     """group : run of each view, by name; views left out as outliers keep the run they lie in.
 
-    outliers : view -> px, rms at which the others of its run predict it. predicted_px : the same, of every view.
+    outliers : view -> px, rms at which the others of its run predict it.
     """
 
     group: dict[str, int]
     outliers: dict[str, float]
-    predicted_px: dict[str, float]
 
     @property
     def count(self) -> int:
+        """Number of runs."""
         return len(set(self.group.values()))
 
     def names(self, number: int) -> list[str]:
@@ -56,9 +57,9 @@ class Grouping:
 
 
 def misfits(problem: Problem, x: Float, camera: str = "thermal") -> Misfits:
-    """Parabolas of every view that both the hub and `camera` see, at parameters x; lenses held.
+    """Parabolas of every view that both the hub and `camera` see, at parameters x (P,); lenses held.
 
-    The misfit is the sum over both cameras' points, divided by the points of `camera`: px².
+    The misfit is the sum of squared px over both cameras' points, divided by the points of `camera`.
     """
     hub_block = next(b for b in problem.points if b.camera == problem.hub)
     block = next(b for b in problem.points if b.camera == camera)
@@ -69,9 +70,8 @@ def misfits(problem: Problem, x: Float, camera: str = "thermal") -> Misfits:
         a, b = hub_block.view == i, block.view == i
         if a.sum() < 4 or b.sum() < 4:
             continue
-        # columns of a point's Jacobian: 9 lens, 6 board pose, 1 spacing, 6 extrinsic
-        Jp = np.concatenate([J_h[a][:, :, 9:15].reshape(-1, 6), J_c[b][:, :, 9:15].reshape(-1, 6)])
-        Je = np.concatenate([np.zeros((2 * a.sum(), 6)), J_c[b][:, :, 16:22].reshape(-1, 6)])
+        Jp = np.concatenate([J[rows][:, :, POSE_COLUMNS].reshape(-1, 6) for J, rows in ((J_h, a), (J_c, b))])
+        Je = np.concatenate([np.zeros((2 * a.sum(), 6)), J_c[b][:, :, EXTRINSIC_COLUMNS].reshape(-1, 6)])
         e = np.concatenate([e_h[a].ravel(), e_c[b].ravel()])
         Q = np.linalg.qr(Jp)[0]  # project the board's pose out
         Je, e = Je - Q @ (Q.T @ Je), e - Q @ (Q.T @ e)
@@ -93,15 +93,15 @@ def find_groups(m: Misfits) -> Grouping:
     for k in range(runs, 0, -1):
         bounds.append((int(cut[k, end]), end))
         end = int(cut[k, end])
-    group, outliers, predicted = {}, {}, {}
+    group, outliers = {}, {}
     for number, (i, j) in enumerate(reversed(bounds)):
         loo = np.sqrt(np.maximum(_leave_one_out(m, i, j), 0))
         limit = max(OUTLIER_FACTOR * float(np.median(loo)), OUTLIER_FLOOR_PX + float(np.sqrt(np.median(own))))
         for v, px in zip(range(i, j), loo, strict=True):
-            group[m.names[v]], predicted[m.names[v]] = number, float(px)
+            group[m.names[v]] = number
             if px > limit:
                 outliers[m.names[v]] = float(px)
-    return Grouping(group, outliers, predicted)
+    return Grouping(group, outliers)
 
 
 def _segment(m: Misfits, n: int, floor: float) -> tuple[Float, Float]:

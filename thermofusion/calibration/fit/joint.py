@@ -11,7 +11,7 @@ from ...geometry.rigid import invert
 from ...types import Camera, Float
 from ..board.views import CalibrationSet
 from .bundle import Options, Problem
-from .cameras import intrinsics_of, to_rt
+from .cameras import FOCAL, INTRINSIC_NAMES, PINHOLE, intrinsics_of, to_rt
 from .single import SingleFit, noise_px
 from .solver import Fit, solve
 from .start import common_transform
@@ -24,7 +24,8 @@ DEPTH_CENTER_PRIOR = 0.01  # of its principal point, image widths
 
 
 def initial_guess(problem: Problem, single: dict[str, SingleFit]) -> Float:
-    """Start of the joint fit: single lenses; poses in the hub's frame, through the extrinsic where the hub is blind."""
+    """Start (P,) of the joint fit, px, rad and m: single lenses; poses in the hub's frame, through the extrinsic where
+    the hub is blind."""
     x = np.zeros(len(problem.names))
     poses = {c: s.poses() for c, s in single.items()}
     hub = problem.hub
@@ -73,7 +74,7 @@ def plausible(fit: Fit, single: dict[str, SingleFit]) -> tuple[Fit, list[str]]:
     """Lenses held at their own fits where the joint one left the limit."""
     notes = []
     for c, s in single.items():
-        away = float(np.abs(fit.block(c)[:2] / s.intrinsics[:2] - 1).max())
+        away = float(np.abs(fit.block(c)[FOCAL] / s.intrinsics[FOCAL] - 1).max())
         if away > FOCAL_LIMIT:
             notes.append(
                 f"the joint fit pulled the {c} focal length {100 * away:.1f} % away from the camera's own: all lenses "
@@ -95,15 +96,14 @@ def lens_priors(
     for c, s in single.items():
         width = problem.sizes[c][0]
         floor = np.array([FOCAL_PRIOR * s.intrinsics[0]] * 2 + [CENTER_PRIOR * width] * 2 + [0.02] * 4)
-        sigma = np.maximum(floor, 4 * s.sigmas[:8])
-        names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
-        out |= {f"{c}.{n}": (float(m), float(e)) for n, m, e in zip(names, s.intrinsics, sigma, strict=False)}
+        sigma = np.maximum(floor, 4 * s.sigmas[: len(floor)])  # all but k3, which the camera's own fit has decided
+        rows = zip(INTRINSIC_NAMES, s.intrinsics, sigma, strict=False)
+        out |= {f"{c}.{n}": (float(m), float(e)) for n, m, e in rows}
     if depth_camera is not None and "depth" not in single:
-        k, w = intrinsics_of(depth_camera), depth_camera.width_px
-        for n, m, e in zip(
-            ("fx", "fy", "cx", "cy"), k, (DEPTH_FOCAL_PRIOR * k[0],) * 2 + (DEPTH_CENTER_PRIOR * w,) * 2, strict=False
-        ):
-            out[f"depth.{n}"] = (float(m), float(e))
+        k = intrinsics_of(depth_camera)[PINHOLE]
+        sigmas = (DEPTH_FOCAL_PRIOR * k[0],) * 2 + (DEPTH_CENTER_PRIOR * depth_camera.width_px,) * 2
+        rows = zip(INTRINSIC_NAMES, k, sigmas, strict=False)
+        out |= {f"depth.{n}": (float(m), float(e)) for n, m, e in rows}
     return out
 
 

@@ -10,9 +10,15 @@ from ...errors import ScanError
 from ...types import Float
 from ..board.views import BoardPoints, CalibrationSet
 
+MIRROR = np.diag([-1.0, 1.0, 1.0])
+CLEARLY = 3.0  # times tighter a reflected relation must fit
+MIN_COMMON_VIEWS = 4  # boards of two cameras: fewer fit a reflection by chance
+AGREE_RAD = 0.1  # median angle of board normals, 6 deg; a reflection turns tilted boards by several times that
+
 
 def handedness(points: BoardPoints, board_m: np.ndarray) -> float:
-    """Sign of the area the board's axes span in the picture: +1 seen from the front, -1 mirrored (or from behind)."""
+    """Sign of the area [px²] that the axes of board_m (N, 3) span in the picture: +1 seen from the front, -1 mirrored
+    or from behind."""
     X = board_m[points.index][:, :2]
     A = np.linalg.lstsq(np.column_stack([X - X.mean(0), np.ones(len(X))]), points.px, rcond=None)[0]
     return float(np.sign(np.linalg.det(A[:2])))
@@ -41,20 +47,16 @@ def refuse_mirrored(data: CalibrationSet) -> None:
             )
 
 
-MIRROR = np.diag([-1.0, 1.0, 1.0])
-CLEARLY = 3.0  # times tighter a reflected relation must fit
-MIN_VIEWS = 4
-AGREE_RAD = 0.1
-
-
 def refuse_mirrored_pair(first: str, poses_a: Mapping[str, Float], second: str, poses_b: Mapping[str, Float]) -> None:
-    """Raises ScanError if two cameras' board poses (T_camera_board by view) fit together only when one is mirrored.
+    """Raises ScanError if two cameras' board poses fit together only when one is mirrored.
+
+    poses_a, poses_b : T_camera_board (4, 4), m, by view.
 
     Detected boards without marks are numbered as if seen from the front, so that a mirrored picture gives boards
     tilted the wrong way: the rotation between the cameras then changes from view to view.
     """
     both = [n for n in poses_a if n in poses_b]
-    if len(both) < MIN_VIEWS:
+    if len(both) < MIN_COMMON_VIEWS:
         return
     A, B = (np.stack([p[n][:3, :3] for n in both]) for p in (poses_a, poses_b))
     plain, flipped = _spread(B @ A.transpose(0, 2, 1)), _spread(MIRROR @ B @ MIRROR @ A.transpose(0, 2, 1))
@@ -68,17 +70,18 @@ def refuse_mirrored_pair(first: str, poses_a: Mapping[str, Float], second: str, 
 
 def fits_unmirrored(plain: tuple[Float, Float]) -> bool:
     """True if board normals (N, 3) of pictures and depth images agree up to one rotation."""
-    return len(plain[0]) >= MIN_VIEWS and _normal_misfit(*plain) < AGREE_RAD
+    return len(plain[0]) >= MIN_COMMON_VIEWS and _normal_misfit(*plain) < AGREE_RAD
 
 
 def refuse_mirrored_depth(plain: tuple[Float, Float], flipped: tuple[Float, Float]) -> None:
     """Raises ScanError if depth images fit the pictures only when flipped left to right.
 
-    plain, flipped : board normals (N, 3) as the hub sees them and as the depth images have them, as they are, flipped.
+    plain, flipped : board normals (N, 3), unit length, as the hub sees them and as the depth images have them, as they
+    are, flipped.
     """
-    if len(flipped[0]) < MIN_VIEWS:
+    if len(flipped[0]) < MIN_COMMON_VIEWS:
         return
-    misfit = _normal_misfit(*plain) if len(plain[0]) >= MIN_VIEWS else np.inf
+    misfit = _normal_misfit(*plain) if len(plain[0]) >= MIN_COMMON_VIEWS else np.inf
     if _normal_misfit(*flipped) * CLEARLY < misfit:
         raise ScanError(
             "the depth images are mirrored against the pictures: flipped left to right they fit",
@@ -98,10 +101,3 @@ def _normal_misfit(a: Float, b: Float) -> float:
     U, _, Vt = np.linalg.svd(a.T @ b)
     R = U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt
     return float(np.median(np.arccos(np.clip(np.einsum("ni,ni->n", a, b @ R.T), -1, 1)))) + 1e-3
-
-
-def unmirror(points: BoardPoints, width_px: int) -> BoardPoints:
-    """Points of a picture flipped left to right."""
-    px = points.px.copy()
-    px[:, 0] = width_px - 1 - px[:, 0]
-    return BoardPoints(points.index, px)

@@ -10,10 +10,10 @@ from ...errors import ScanError
 from ...geometry.rigid import invert
 from ...scans.native.depth_correction import MetricDepth
 from ...types import Camera, Float
-from ..board.views import CalibrationSet, View
+from ..board.views import CAMERAS, BoardView, CalibrationSet
 from .bundle import Options, Problem
-from .cameras import camera_of, from_rt, project_with_jacobian, to_rt
-from .depth_fit import DepthImages, check_depth_orientation, default_depth_camera, fit_with_depth, with_depth
+from .cameras import camera_with, from_rt, project_with_jacobian, to_rt
+from .depth_fit import DepthImages, DepthStart, add_depth, default_depth_camera
 from .depth_model import DepthModel, DisparityDepth
 from .groups import Grouping, find_groups, misfits
 from .joint import fit_jointly, initial_guess
@@ -22,17 +22,19 @@ from .single import SingleFit, fit_camera
 from .solver import Fit, solve
 from .start import board_pose
 
+STEP = 1e-6  # rad and m, of derivatives by differences
+
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """Everything a calibration found.
 
-    cameras : by name; `T_color_depth`, `T_thermal_depth` of the chosen group (None: not determined). fit : the joint
-    bundle. single : each camera alone. grouping : None with fewer than two cameras. spacing_m and its sigma.
-    depth_model, depth_parameters : correction of reported depth. notes : sentences for the user, worst first.
+    fit : the joint bundle. single : each camera alone. grouping : None with fewer than two cameras. chosen_group : the
+    state of the rig reported. cameras : by name. extrinsics : `T_color_depth`, `T_thermal_depth` (4, 4), m, of that
+    state (without depth `T_thermal_color`); extrinsic_covariance : (6, 6), rad and m. spacing_m and its sigma.
+    notes : sentences for the user, worst first.
     """
 
-    data: CalibrationSet
     fit: Fit
     single: dict[str, SingleFit]
     grouping: Grouping | None
@@ -42,14 +44,20 @@ class Calibration:
     extrinsic_covariance: dict[str, Float]
     spacing_m: float
     spacing_sigma_m: float
-    depth_model: DepthModel | None
     notes: tuple[str, ...] = field(default=())
 
     @property
-    def depth_parameters(self) -> Float | None:
-        return None if self.depth_model is None else self.fit.block("depth_model")
+    def data(self) -> CalibrationSet:
+        """What was seen, without what was left out."""
+        return self.fit.problem.data
+
+    @property
+    def depth_model(self) -> DepthModel | None:
+        """Of the reported depth's error; its parameters are the fit's block of that name."""
+        return self.fit.problem.depth_model
 
     def views_used(self) -> list[str]:
+        """Names of the views in the fit."""
         return [v.name for v in self.fit.problem.views]
 
 
@@ -66,9 +74,9 @@ def calibrate_views(
 ) -> Calibration:
     """Cameras, rig and depth from what was seen of the board.
 
-    depth_images : view name -> loader of metres (NaN none) or, for depth_kind `disparity`, of raw disparity.
+    depth_images : view name -> loader of (H, W), m (NaN none), or, for depth_kind `disparity`, raw disparity.
     depth_camera : its data sheet (default: a Kinect's field of view), or with `depth_lens_known` the maker's own
-    calibration of this very camera, which is then held. T_depth_hub : first guess, default identity.
+    calibration of this very camera, which is then held. T_depth_hub : (4, 4) first guess, default identity.
     free_spacing : estimate the board's spacing; depth must then be true in scale. group : which state of the rig to
     report where it moved; default the one with most views.
 
@@ -83,40 +91,16 @@ def calibrate_views(
     notes = _group_notes(grouping)
     if grouping is not None and grouping.outliers:
         data = replace(data, views=tuple(_without(v, grouping) for v in data.views))
-    groups = None if grouping is None else _spread(grouping, [v.name for v in data.views])
-    fit, more = fit_jointly(data, single, groups)
-    model: DepthModel | None = None
+    groups = None if grouping is None else _runs(grouping, [v.name for v in data.views])
+    fit, held = fit_jointly(data, single, groups)
     if depth_images:
         lens = depth_camera or default_depth_camera(depth_images)
-        size = (lens.width_px, lens.height_px)
-        if data.image_size.get("depth", size) != size:
-            raise ScanError(
-                "the infrared pictures are {} x {} px, the depth images {} x {}".format(
-                    *data.image_size["depth"], *size
-                ),
-                hint="crop them to the same pixels: both must be one camera's",
-            )
-        model = DisparityDepth(size) if depth_kind == "disparity" else MetricDepth(size)
-        guess = np.eye(4) if T_depth_hub is None else T_depth_hub
-        T, margin = guess, -0.1
-        points = fit
-        if "depth" in single:  # infrared pictures say where the depth camera is
-            T, margin = from_rt(fit.block(f"T_depth_{fit.problem.hub}")), 0.0
-            lens = lens if depth_lens_known else camera_of(fit.block("depth"), size)
-        if depth_kind == "metric":
-            check_depth_orientation(data, depth_images, lens, T, fit)
-        for turn in range(3):  # again, knowing where the board lies in the depth image
-            scale = float(np.exp(fit.block("spacing")[0]))
-            seen = with_depth(data, depth_images, lens, T, fit.board_poses(), depth_kind, margin, scale)
-            fit, extra = fit_with_depth(
-                points, seen, single, groups, model, depth_camera or lens, T, guess, free_spacing, depth_lens_known
-            )
-            lens = camera_of(fit.block("depth"), size)
-            T, margin = from_rt(fit.block(f"T_depth_{fit.problem.hub}")), 0.0
-            if turn == 1 and not any(v.depth_marks for v in seen.views):
-                break
-        data, more = seen, more + extra
-    return _assemble(data, fit, single, grouping, model, group, (*notes, *more))
+        model = (DisparityDepth if depth_kind == "disparity" else MetricDepth)((lens.width_px, lens.height_px))
+        T = np.eye(4) if T_depth_hub is None else T_depth_hub
+        start = DepthStart(depth_images, model, depth_camera, depth_lens_known, T, free_spacing, lens, T)
+        fit, more = add_depth(fit, single, start)
+        held = held + more
+    return _assemble(fit, single, grouping, group, (*notes, *held))
 
 
 def _refuse_mirrored_pairs(single: dict[str, SingleFit]) -> None:
@@ -136,12 +120,12 @@ def _grouping(data: CalibrationSet, single: dict[str, SingleFit]) -> Grouping | 
     return find_groups(misfits(problem, fit.x))
 
 
-def _without(view: View, grouping: Grouping) -> View:
+def _without(view: BoardView, grouping: Grouping) -> BoardView:
     """The view with its thermal points left out if it was named an outlier: colour and depth may still be good."""
     return view.with_points("thermal", None) if view.name in grouping.outliers else view
 
 
-def _spread(grouping: Grouping, names: list[str]) -> dict[str, int]:
+def _runs(grouping: Grouping, names: list[str]) -> dict[str, int]:
     """Views that the second camera did not see take the run of the view before them."""
     out, last = {}, min(grouping.group.values())
     for n in names:
@@ -166,30 +150,23 @@ def _group_notes(grouping: Grouping | None) -> list[str]:
 
 
 def _assemble(
-    data: CalibrationSet,
-    fit: Fit,
-    single: dict[str, SingleFit],
-    grouping: Grouping | None,
-    model: DepthModel | None,
-    group: int | None,
-    notes: tuple[str, ...],
+    fit: Fit, single: dict[str, SingleFit], grouping: Grouping | None, group: int | None, notes: tuple[str, ...]
 ) -> Calibration:
     problem = fit.problem
-    counts = np.bincount(problem.group)
-    chosen = int(np.argmax(counts)) if group is None else group
-    lenses = {c: camera_of(fit.block(c), problem.sizes[c]) for c in {*problem.cameras, *(["depth"] if model else [])}}
+    chosen = int(np.argmax(np.bincount(problem.group))) if group is None else group
+    lenses = {c: camera_with(fit.block(c), problem.sizes[c]) for c in CAMERAS if c in problem.slices}
     extrinsics, covariances = derived_extrinsics(fit, chosen)
     s = problem.slices["spacing"].start
-    spacing = data.board.spacing_m * float(np.exp(fit.x[s]))
+    spacing = problem.data.board.spacing_m * float(np.exp(fit.x[s]))
     sigma = spacing * float(np.sqrt(fit.covariance[s, s]))
     if not fit.converged:
         notes = (f"the joint fit did not converge ({fit.message})", *notes)
-    return Calibration(
-        data, fit, single, grouping, chosen, lenses, extrinsics, covariances, spacing, sigma, model, notes
-    )
+    return Calibration(fit, single, grouping, chosen, lenses, extrinsics, covariances, spacing, sigma, notes)
 
 
-def predict_px(calibration: Calibration, view: View, *, camera: str = "thermal", group: int | None = None) -> Float:
+def predict_px(
+    calibration: Calibration, view: BoardView, *, camera: str = "thermal", group: int | None = None
+) -> Float:
     """(N, 2) px: where the rig puts the board points of `camera` minus where they were seen.
 
     The board's pose is taken from the hub's picture alone; the view need not have been part of the fit."""
@@ -202,7 +179,9 @@ def predict_px(calibration: Calibration, view: View, *, camera: str = "thermal",
     return project_with_jacobian(X, fit.block(camera))[0] - view.points[camera].px
 
 
-def held_out_px(calibration: Calibration, view: View, *, camera: str = "thermal", group: int | None = None) -> Float:
+def held_out_px(
+    calibration: Calibration, view: BoardView, *, camera: str = "thermal", group: int | None = None
+) -> Float:
     """(N, 2) px residuals of `camera` in a view that took no part in the fit, as a training view would have them.
 
     The rig is held; the board's pose, unknown for every view, is fitted to all cameras at the fit's own weights.
@@ -221,20 +200,22 @@ def held_out_px(calibration: Calibration, view: View, *, camera: str = "thermal"
     return alone.residuals()[camera][0]
 
 
+def _relative(a: Float, b: Float) -> Float:
+    """`to_rt` of T_a_hub @ T_hub_b, from the (6,) of T_a_hub and T_b_hub."""
+    return to_rt(from_rt(a) @ invert(from_rt(b)))
+
+
 def derived_extrinsics(fit: Fit, group: int) -> tuple[dict[str, Float], dict[str, Float]]:
     """T_color_depth, T_thermal_depth (or T_thermal_color without depth) and (6, 6) covariances of their (rotation
     vector [rad], translation [m]), by differences of the composed transform."""
     p = fit.problem
-    keys = {c: p.extrinsic_key(c, group if c == "thermal" else 0) for c in ("color", "thermal", "depth")}
+    keys = {c: p.extrinsic_key(c, group if c == "thermal" else 0) for c in CAMERAS}
     rt = {c: (np.zeros(6) if c == p.hub else fit.block(k)) for c, k in keys.items() if c == p.hub or k in p.slices}
     base = "depth" if "depth" in rt else p.hub
     out, cov = {}, {}
     for c in rt:
         if c == base:
             continue
-
-        def relative(a: Float, b: Float) -> Float:
-            return to_rt(from_rt(a) @ invert(from_rt(b)))
 
         columns, J = [], []
         for name, first in ((c, True), (base, False)):
@@ -244,13 +225,10 @@ def derived_extrinsics(fit: Fit, group: int) -> tuple[dict[str, Float], dict[str
             columns += list(range(s.start, s.stop))
             for k in range(6):
                 h = np.zeros(6)
-                h[k] = 1e-6
-                up, down = (relative(rt[c] + (d if first else 0), rt[base] + (0 if first else d)) for d in (h, -h))
-                J.append((up - down) / 2e-6)
+                h[k] = STEP
+                up, down = (_relative(rt[c] + (d if first else 0), rt[base] + (0 if first else d)) for d in (h, -h))
+                J.append((up - down) / (2 * STEP))
         Jm = np.array(J).T
         out[f"T_{c}_{base}"] = from_rt(rt[c]) @ invert(from_rt(rt[base]))
         cov[f"T_{c}_{base}"] = Jm @ fit.covariance[np.ix_(columns, columns)] @ Jm.T
     return out, cov
-
-
-__all__ = ["Calibration", "calibrate_views", "derived_extrinsics", "held_out_px", "predict_px"]

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import ScanError
+from ...progress import Progress, silent
 from ...types import Float
 from ..board.board import Board
 from ..board.views import CalibrationSet
@@ -35,13 +36,13 @@ from .joint import initial_guess
 from .single import SingleFit, fit_camera
 from .solver import solve
 
-SEARCH_VIEWS = 10
+SEARCH_VIEWS = 10  # tell focal length and roll, which all views share; more only take longer
 FOCAL_STEPS = np.geomspace(0.7, 2.4, 28)  # image widths: 71 to 24 deg field of view
-ROLLS_DEG = (-4.0, -2.0, 0.0, 2.0, 4.0)
+ROLLS_DEG = (-4.0, -2.0, 0.0, 2.0, 4.0)  # of the thermal camera against the colour camera, both held upright
 COARSE = 2  # the first search is done on a smaller picture
-ROUNDS = 3
+ROUNDS = 3  # of predicting, detecting, calibrating: each adds the views that the last could predict
 REACH_PX = 14.0  # a prediction of a calibrated rig is not worse, knocks of the tripod included
-MIN_START = 3
+MIN_START = 3  # views, as `start.zhang` needs to calibrate the thermal camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,35 +54,39 @@ class ThermalPictures:
 
     @staticmethod
     def of(images: Mapping[str, NDArray]) -> ThermalPictures:
+        """Of pictures (H, W), counts, by view name."""
         pattern = fixed_pattern(list(images.values()))
         clean = {n: i.astype(np.float32) - (0 if pattern is None else pattern) for n, i in images.items()}
         return ThermalPictures(clean, tuple(n for n, i in images.items() if is_saturated(i)))
 
     def spots(self, name: str, step: float) -> NDArray[np.float32]:
-        """Spot map with the spot size that fits the grid's step, px."""
+        """Spot map (H, W) with the spot size that fits the grid's step, px."""
         return spot_map(self.clean[name], float(np.clip(0.04 * step, SPOT_SIGMA_PX, 1.8)))
 
 
 def detect_thermal_set(
-    data: CalibrationSet, images: Mapping[str, NDArray]
+    data: CalibrationSet, images: Mapping[str, NDArray], progress: Progress = silent
 ) -> tuple[CalibrationSet, dict[str, Detection]]:
     """Thermal points of all views from `images` (H, W) counts by view name; `data` has colour points.
 
     Returns the set with thermal points, and every view's detection (accepted and rejected points).
     Raises ScanError if the board is found in too few pictures, and says if they are saturated.
     """
+    progress("thermal boards", 0, ROUNDS + 1)
     pictures = ThermalPictures.of(images)
     color = fit_camera(data, "color")
     size = _size(images)
     poses = {n: T for n, T in color.poses().items() if n in images}
     found = _first(data, pictures, poses, size)
     data = replace(data, image_size={**data.image_size, "thermal": size})
-    for _ in range(ROUNDS):
+    for number in range(ROUNDS):
+        progress("thermal boards", number + 1, ROUNDS + 1)
         good = {n: d for n, d in found.items() if d.score > 0}
         if len(good) < MIN_START:
             raise ScanError(_why(pictures, len(good), len(images)), hint=_next_step(pictures))
         data = with_detections(data, found)
         found = _predicted(data, color, pictures, found)
+    progress("thermal boards", ROUNDS + 1, ROUNDS + 1)
     return with_detections(data, found), found
 
 
@@ -201,6 +206,3 @@ def _next_step(pictures: ThermalPictures) -> str:
     if pictures.saturated:
         return "widen the camera's temperature range and record again"
     return "warm the board, hold something warm beside the camera, check columns and rows, or pick points by hand"
-
-
-__all__ = ["ThermalPictures", "detect_thermal_set", "with_detections"]

@@ -8,9 +8,9 @@ import numpy as np
 
 from ...errors import ScanError
 from ...types import Camera, Float
-from ..board.views import CalibrationSet, View
+from ..board.views import BoardView, CalibrationSet
 from .bundle import Options, Problem
-from .cameras import LensPrior, camera_of, from_rt, to_rt
+from .cameras import LensPrior, camera_with, from_rt, to_rt
 from .solver import Fit, solve
 from .start import zhang
 
@@ -31,22 +31,26 @@ class SingleFit:
 
     @property
     def intrinsics(self) -> Float:
+        """(9,) px and none."""
         return self.fit.block(self.camera)
 
     @property
     def sigmas(self) -> Float:
-        """(9,) one sigma of the intrinsics; 0 for what was held."""
+        """(9,) one sigma of the intrinsics, px and none; 0 for what was held."""
         return np.sqrt(np.diag(self.fit.block_covariance(self.camera)))
 
     @property
     def model(self) -> Camera:
-        return camera_of(self.intrinsics, self.fit.problem.sizes[self.camera])
+        """The lens found."""
+        return camera_with(self.intrinsics, self.fit.problem.sizes[self.camera])
 
     @property
     def rms_px(self) -> float:
+        """Root mean square distance of projected and seen points, px."""
         return self.fit.rms_px(self.camera)
 
     def poses(self) -> dict[str, Float]:
+        """T_camera_board (4, 4), m, by view."""
         return {v.name: from_rt(self.fit.block(f"view:{v.name}")) for v in self.fit.problem.views}
 
 
@@ -55,7 +59,7 @@ def fit_camera(data: CalibrationSet, camera: str, *, lens: LensPrior | None = No
 
     Raises ScanError: too few views, boards all parallel, or a residual that says the board is another one.
     """
-    one = replace(data, views=tuple(View(v.name, {camera: v.points[camera]}) for v in data.seen_by(camera)))
+    one = replace(data, views=tuple(BoardView(v.name, {camera: v.points[camera]}) for v in data.seen_by(camera)))
     start, poses = zhang(one, camera)
     _check_tilts(camera, np.stack(list(poses.values())))
     problem = Problem(one)
@@ -73,7 +77,7 @@ def fit_camera(data: CalibrationSet, camera: str, *, lens: LensPrior | None = No
             hint="check the board's columns and rows, and that only one board is in view",
         )
     cubic = _with_noise(problem, plain.x, replace(plain.options, fixed=frozenset({"spacing"})), camera)
-    k3 = problem.slices[camera].start + 8
+    k3 = problem.names.index(f"{camera}.k3")
     carried = abs(cubic.x[k3]) > K3_SIGMAS * np.sqrt(cubic.covariance[k3, k3])
     carried = carried and cubic.rms_px(camera) < (1 - K3_GAIN) * plain.rms_px(camera)
     fit = cubic if carried else plain

@@ -16,8 +16,8 @@ from .cameras import from_rt
 
 ROBUST_SIGMAS = 2.5  # residuals beyond this many sigmas count linearly (Huber)
 ROBUST_START = 6.0  # the first round is milder, so that a poor start does not throw good points away
-MAX_EVALUATIONS = 15
-MAX_ROUNDS = 20
+MAX_EVALUATIONS = 15  # of the residuals in a round; the next round goes on from there
+MAX_ROUNDS = 20  # of reweighting; a fit that has not settled by then is reported as not converged
 WEIGHTS_SETTLED = 0.05  # largest change of a weight between rounds that no longer matters to any number
 
 
@@ -34,7 +34,7 @@ class Fit:
     message: str
 
     def block(self, key: str) -> Float:
-        """The values of a block."""
+        """The values (B,) of a block: px and none of a lens, rad and m of a pose."""
         return self.x[self.problem.slices[key]]
 
     def board_poses(self) -> dict[str, Float]:
@@ -48,6 +48,7 @@ class Fit:
         return out
 
     def block_covariance(self, key: str) -> Float:
+        """(B, B) covariance of a block, its units (px, rad, m) squared; 0 where it was held."""
         s = self.problem.slices[key]
         return self.covariance[s, s]
 

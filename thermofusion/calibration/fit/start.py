@@ -9,20 +9,20 @@ from ...errors import ScanError
 from ...geometry.rigid import invert
 from ...types import Float
 from ..board.views import BoardPoints, CalibrationSet
-from .cameras import intrinsics_of, to_rt
+from .cameras import DISTORTION, TURN, matrix, to_rt
 
-MIN_VIEWS = 3
+MIN_BOARD_VIEWS = 3  # of one camera: fewer leave focal length and principal point open (Zhang 2000)
 
 
 def zhang(data: CalibrationSet, camera: str) -> tuple[Float, dict[str, Float]]:
-    """Intrinsics (9,) with two radial terms and T_camera_board by view, from OpenCV's closed form and refinement.
+    """Intrinsics (9,) with two radial terms and T_camera_board (4, 4), m, by view, by OpenCV.
 
     Raises ScanError if fewer than three views show the board.
     """
     views = data.seen_by(camera)
-    if len(views) < MIN_VIEWS:
+    if len(views) < MIN_BOARD_VIEWS:
         raise ScanError(
-            f"the {camera} camera sees the board in {len(views)} views, {MIN_VIEWS} are the least",
+            f"the {camera} camera sees the board in {len(views)} views, {MIN_BOARD_VIEWS} are the least",
             hint="record 15 to 30 views, tilted to all sides, all over the picture",
         )
     board = data.board.points_m.astype(np.float32)
@@ -47,10 +47,9 @@ def zhang(data: CalibrationSet, camera: str) -> tuple[Float, dict[str, Float]]:
 
 
 def board_pose(points: BoardPoints, board_m: Float, intrinsics: Float) -> Float:
-    """T_camera_board (4, 4) of one view with a known camera (planar PnP, then refined)."""
-    fx, fy, cx, cy = intrinsics[:4]
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-    X, d = board_m[points.index], intrinsics[4:9]
+    """T_camera_board (4, 4), m, from points seen of board_m (N, 3) and known intrinsics (9,): planar PnP, refined."""
+    K = matrix(intrinsics)
+    X, d = board_m[points.index], intrinsics[DISTORTION]
     _, rv, tv = cv2.solvePnP(X, points.px, K, d, flags=cv2.SOLVEPNP_IPPE)
     rv, tv = cv2.solvePnPRefineLM(X, points.px, K, d, rv, tv)
     T = np.eye(4)
@@ -61,9 +60,6 @@ def board_pose(points: BoardPoints, board_m: Float, intrinsics: Float) -> Float:
 def common_transform(T: Float) -> Float:
     """The one of (N, 4, 4) transforms that agrees best with the others (medoid of angle + distance in units of 1 m)."""
     relative = invert(T)[:, None] @ T[None]
-    angle = np.linalg.norm(to_rt(relative)[..., :3], axis=-1)
+    angle = np.linalg.norm(to_rt(relative)[..., TURN], axis=-1)
     shift = np.linalg.norm(relative[..., :3, 3], axis=-1)
     return T[np.argmin(np.sum(np.minimum(angle + shift, 1.0), axis=1))]
-
-
-__all__ = ["board_pose", "common_transform", "intrinsics_of", "zhang"]

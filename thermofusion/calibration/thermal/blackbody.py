@@ -12,14 +12,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
 from ...errors import ScanError
 from ...files.reading import inside, read_bytes, read_json, read_text
-from ...files.strict import validated
+from ...files.strict import Border, validated
 from ...files.whole import replacing, write_text
 from ...scans.native.schema import SignalDoc
-from ...types import Float
+from ...types import Float, SignalCurve
 from .radiometric import PixelField, RadiometricCurve, check_monotone
 from .source import ThermalSource
 
@@ -38,7 +37,7 @@ class Box:
     height_px: int
 
     def cut(self, image: Float, place: object = None) -> Float:
-        """That part of (H, W). Raises ScanError if it is not inside."""
+        """That part of a picture (H, W), px. Raises ScanError if it is not inside."""
         h, w = image.shape
         right, bottom = self.left_px + self.width_px, self.top_px + self.height_px
         if not (0 <= self.left_px < right <= w and 0 <= self.top_px < bottom <= h):
@@ -103,8 +102,7 @@ def _median_counts(reading: Reading, opener: Opener) -> float:
 # ---------------------------------------------------------------- files
 
 
-class _CurveDoc(BaseModel):
-    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+class _CurveDoc(Border):
     schema_: Literal["thermofusion-curve/1"]
     signal: SignalDoc
     counts_range: tuple[float, float]
@@ -112,13 +110,17 @@ class _CurveDoc(BaseModel):
     sigma_K: float
 
 
+def signal_document(signal: SignalCurve) -> dict[str, Any]:
+    """`signal` of a scan.json for a camera that stores counts."""
+    parameters = {k: list(v) if len(v) > 1 else v[0] for k, v in signal.parameters.items()}
+    return {"kind": signal.kind, "curve": {"type": signal.curve, **parameters}}
+
+
 def curve_document(curve: RadiometricCurve, readings: int) -> dict[str, Any]:
     """curve.json: `signal` as scan.json takes it, where it holds, and how well."""
-    signal = curve.signal_curve()
-    parameters = {k: list(v) if len(v) > 1 else v[0] for k, v in signal.parameters.items()}
     return {
         "schema": CURVE_SCHEMA,
-        "signal": {"kind": signal.kind, "curve": {"type": signal.curve, **parameters}},
+        "signal": signal_document(curve.signal_curve()),
         "counts_range": list(curve.counts_range),
         "degC_range": sorted(curve.to_degC(np.array(curve.counts_range)).tolist()),
         "residual_K": curve.residual_K,

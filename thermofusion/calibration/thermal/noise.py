@@ -14,11 +14,11 @@ from ...errors import ScanError
 from ...robust import SIGMA_PER_MAD, mad_sigma
 from ...types import Float
 
-MIN_STILL_FRAMES = 8
-MIN_EDGE_ROWS = 12
+MIN_STILL_FRAMES = 8  # fewer differences of frames tell a pixel's noise to no better than a third
+MIN_EDGE_ROWS = 12  # that cross the edge, each at another phase of the pixels
 MIN_SLANT_PX = 1.0  # across all rows: an edge along the pixels is sampled at one phase only
-BLOCK_PX = 8
-ALLAN_PIXELS = 2000
+BLOCK_PX = 8  # side of the blocks whose change tells motion: their own noise is an eighth of a pixel's
+ALLAN_PIXELS = 2000  # of a frame, evenly spread: their rms is sure to 2 %
 MOVING_FACTOR = 4.0  # rows and columns of real sensors share some noise: a block is not quieter by its side exactly
 NETD_PIXELS = 5000  # of a frame, evenly spread: more say nothing new and fill the memory
 
@@ -47,7 +47,7 @@ class StillNoise:
 
 
 def still_noise(frames_degC: Iterable[NDArray], times_s: NDArray) -> StillNoise:
-    """From frames (H, W) of a scene that does not move, at times (N,); they are read one after the other.
+    """From frames_degC, each (H, W), of a scene that does not move, at times_s (N,); they are read one after the other.
 
     Raises ScanError with fewer than 8 frames, or times that are not finite and rising.
     """
@@ -132,7 +132,29 @@ def edge_spread(image: NDArray) -> EdgeSpread:
     x = np.asarray(image, np.float64)
     if np.abs(np.nanmean(np.diff(x, axis=0))) > np.abs(np.nanmean(np.diff(x, axis=1))):
         x = x.T
-    h, w = x.shape
+    (h, w), (slope, offset) = x.shape, _edge_line(x)
+    vv, uu = np.mgrid[0:h, 0:w]
+    distance = (uu - slope * vv - offset) / np.hypot(1, slope)
+    near = np.abs(distance) < min(12.0, w / 2)
+    d, g = distance[near], x[near]
+    lo, hi = np.median(g[d < -4]), np.median(g[d > 4])
+
+    def residual(p: Float) -> Float:
+        level, contrast, place, log_sigma = p
+        return level + contrast * ndtr((d - place) / np.exp(log_sigma)) - g
+
+    fit = least_squares(residual, [lo, hi - lo, 0.0, 0.0], loss="soft_l1", f_scale=0.1 * abs(hi - lo) + 1e-9)
+    s2 = np.mean(residual(fit.x) ** 2)
+    variance = np.diag(np.linalg.inv(fit.jac.T @ fit.jac) * s2)
+    _, contrast, _, log_sigma = fit.x
+    sigma = float(np.exp(log_sigma))
+    angle = float(np.degrees(np.arctan(slope)))
+    return EdgeSpread(sigma, sigma * float(np.sqrt(variance[-1])), float(abs(contrast)), angle)
+
+
+def _edge_line(x: Float) -> tuple[float, float]:
+    """Slope and offset [px] of the edge's column over the row. Raises ScanError: no edge, bent, along the pixels."""
+    w = x.shape[1]
     gradient = np.abs(np.diff(x, axis=1))
     gradient = np.maximum(gradient - 3 * np.median(gradient), 0)
     rows = gradient.sum(axis=1) > 0
@@ -149,18 +171,4 @@ def edge_spread(image: NDArray) -> EdgeSpread:
         raise ScanError("the hot edge is not straight", hint="cut out a part with one straight edge")
     if np.abs(slope) * np.ptp(y) < MIN_SLANT_PX:
         raise ScanError("the hot edge runs along the pixels", hint="turn the edge by 3 to 10 degrees and record again")
-    vv, uu = np.mgrid[0:h, 0:w]
-    distance = (uu - slope * vv - offset) / np.hypot(1, slope)
-    near = np.abs(distance) < min(12.0, w / 2)
-    d, g = distance[near], x[near]
-    lo, hi = np.median(g[d < -4]), np.median(g[d > 4])
-
-    def residual(p: Float) -> Float:
-        return p[0] + p[1] * ndtr((d - p[2]) / np.exp(p[3])) - g
-
-    fit = least_squares(residual, [lo, hi - lo, 0.0, 0.0], loss="soft_l1", f_scale=0.1 * abs(hi - lo) + 1e-9)
-    s2 = np.mean(residual(fit.x) ** 2)
-    C = np.linalg.inv(fit.jac.T @ fit.jac) * s2
-    sigma = float(np.exp(fit.x[3]))
-    angle = float(np.degrees(np.arctan(slope)))
-    return EdgeSpread(sigma, sigma * float(np.sqrt(C[3, 3])), float(abs(fit.x[1])), angle)
+    return slope, offset

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from ...errors import ScanError
+from ...physics.band import ZERO_DEGC_K
 from ...types import Float, SignalCurve
 
-ZERO_DEGC_K = 273.15
-MONOTONE_STEPS = 2001
+MONOTONE_STEPS = 2001  # places of a range at which a curve is looked at: a turn as short as 1/2000 of it shows
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class RadiometricCurve:
     sigma_K: float
 
     def to_degC(self, counts: NDArray) -> Float:
-        """Temperatures of counts. Raises ScanError if a finite count lies outside the range of the fit."""
+        """degC of counts, any shape. Raises ScanError if a finite count lies outside the range of the fit."""
         g = np.asarray(counts, np.float64)
         lo, hi = self.counts_range
         outside = np.isfinite(g) & ((g < lo) | (g > hi))
@@ -66,7 +66,7 @@ class RadiometricCurve:
 
 
 def evaluate(kind: str, parameters: tuple[float, ...], counts: Float) -> Float:
-    """The bare formula, wherever it is asked; degC."""
+    """The bare formula, wherever it is asked: degC of counts, any shape."""
     if kind == "polynomial":
         out = np.zeros_like(counts)
         for c in reversed(parameters):
@@ -80,7 +80,7 @@ def evaluate(kind: str, parameters: tuple[float, ...], counts: Float) -> Float:
 def fit_polynomial(
     counts: NDArray, degC: NDArray, *, degree: int = 4, counts_range: tuple[float, float] | None = None
 ) -> RadiometricCurve:
-    """Eq. 1 from blackbody readings (N,). Fitted in a centred variable and expanded exactly (rational arithmetic).
+    """Eq. 1 from blackbody readings, counts (N,) and degC (N,), in a centred variable, expanded exactly (in fractions).
 
     counts_range : what the curve is for; by default, and at most, what was read.
     Raises ScanError: too few readings, a range beyond them, or a curve that turns inside its range (naming where).
@@ -101,8 +101,11 @@ def fit_polynomial(
 def fit_planck(
     counts: NDArray, degC: NDArray, *, fix_F: bool = True, counts_range: tuple[float, float] | None = None
 ) -> RadiometricCurve:
-    """R, B, F, O from blackbody readings: S = R/(exp(B/T) - F) + O. F = 1 unless `fix_F` is False (it takes a wide
-    range of temperatures to tell F from B). counts_range and errors as in `fit_polynomial`."""
+    """R, B, F, O from blackbody readings, counts (N,) and degC (N,): S = R/(exp(B/T) - F) + O.
+
+    F = 1 unless `fix_F` is False (it takes a wide range of temperatures to tell F from B). counts_range and errors as
+    in `fit_polynomial`.
+    """
     g, T = _readings(counts, degC, 5)
     K = T + ZERO_DEGC_K
     slope = (g[-1] - g[0]) / (K[-1] - K[0])
@@ -205,7 +208,7 @@ class PixelField:
 
 
 def fit_field(frames_degC: NDArray, degC: NDArray, *, degree: int = 1) -> PixelField:
-    """Per-pixel polynomial of what a uniform source at `degC` (N,) reads too high in frames (N, H, W).
+    """Per-pixel polynomial of what a uniform source at `degC` (N,) reads too high in frames_degC (N, H, W).
 
     Raises ScanError with fewer levels than coefficients.
     """

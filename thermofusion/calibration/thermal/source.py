@@ -19,7 +19,7 @@ from ...scans.thermal.flir import recognise as is_flir
 from ...types import Float, Scan, SignalCurve
 from .radiometric import RadiometricCurve
 
-SUFFIXES = (".png", ".tiff", ".tif", ".pgm", ".raw")
+THERMAL_SUFFIXES = (".png", ".tiff", ".tif", ".pgm", ".raw")
 
 
 @dataclass(frozen=True)
@@ -96,15 +96,15 @@ class ThermalSource:
         return out
 
     def mean_degC(self, curve: RadiometricCurve | None = None) -> Float:
-        """(H, W) mean of all frames."""
+        """(H, W) mean of all frames, degC."""
         return _mean(lambda i: self.degC(i, curve), len(self))
 
     def mean_counts(self) -> Float:
-        """(H, W) mean of all frames."""
+        """(H, W) mean of all frames, counts."""
         return _mean(lambda i: self.counts(i).astype(np.float64), len(self))
 
     def mean_shown(self, curve: RadiometricCurve | None = None) -> tuple[Float, str]:
-        """Mean of all frames and its unit: degC where a curve is known, else counts."""
+        """Mean (H, W) of all frames and its unit: degC where a curve is known, else counts."""
         if curve is None and self.signal is None and self.load(0).dtype.kind in "iu":
             return self.mean_counts(), "counts"
         return self.mean_degC(curve), "degC"
@@ -144,7 +144,7 @@ def _open(path: Path, raw: RawLayout | None) -> ThermalSource:
             raise ScanError("every thermal frame of the recording is marked as a shutter frame", place=path)
         places = tuple(stream.places[k] for k in kept)
         return ThermalSource(places, stream.times_s[kept], lambda i: stream.load(kept[i]), stream.camera.signal, scan)
-    files = sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES) if path.is_dir() else [path]
+    files = sorted(p for p in path.iterdir() if p.suffix.lower() in THERMAL_SUFFIXES) if path.is_dir() else [path]
     if not files:
         raise ScanError("there are no thermal pictures here", place=path, hint="expected PNG, TIFF, PGM or .raw")
     shape = _picture(files[0], raw, None).shape[:2]

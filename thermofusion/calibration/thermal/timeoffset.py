@@ -18,9 +18,10 @@ from ...progress import Progress, silent
 from ...robust import mad_sigma
 from ...types import Camera, Float, Scan
 
-MIN_SAMPLES = 12
-MIN_TRAVEL_PX = 15.0
-OBJECT_THICKNESS_M = 0.08
+MIN_SAMPLES = 12  # of either camera: eight numbers of the relation and the offset are fitted to them
+MIN_TRAVEL_PX = 15.0  # in the thermal picture: less and the centroid's own noise hides the motion
+OBJECT_THICKNESS_M = 0.08  # what lies within a hand's thickness behind the nearest point is the object
+STEP_S = 0.005  # of the search, far below a frame's time; a parabola refines the best one
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,15 +29,12 @@ class TimeOffset:
     """offset_s is added to a thermal frame's own time to get the depth clock's time (scan.json `time_offset_s`).
 
     sigma_s : one sigma. residual_px : rms of the thermal track at the best offset. frames : thermal frames used.
-    tried_s, cost_px : the search.
     """
 
     offset_s: float
     sigma_s: float
     residual_px: float
     frames: int
-    tried_s: Float
-    cost_px: Float
 
 
 def scan_time_offset(scan: Scan, *, max_offset_s: float = 0.5, progress: Progress = silent) -> TimeOffset:
@@ -67,7 +65,8 @@ def estimate_time_offset(
     *,
     max_offset_s: float = 0.5,
 ) -> TimeOffset:
-    """From tracks: (N, 3) m in the depth frame at depth times, (M, 2) px at thermal times; rows with NaN are left out.
+    """From tracks: position_m (N, 3) in the depth frame at depth_times_s (N,), position_px (M, 2) at thermal_times_s
+    (M,); rows with NaN are left out.
 
     The relation is u = a·(x/z, y/z, 1/z, 1), which holds exactly for cameras whose axes are parallel.
     Raises ScanError if the object hardly moves, moves steadily one way, or is seen too rarely.
@@ -84,21 +83,8 @@ def estimate_time_offset(
     if np.ptp(q, axis=0).max() < MIN_TRAVEL_PX:
         raise ScanError("the warm object hardly moves", hint="wave it to and fro across the picture")
     spline = CubicSpline(td, np.column_stack([p[:, 0] / p[:, 2], p[:, 1] / p[:, 2], 1 / p[:, 2]]))
-
-    def cost(offset: float) -> float:
-        A = np.column_stack([spline(tt + offset), np.ones(len(tt))])
-        A[:, :3] -= A[:, :3].mean(0)
-        A[:, :3] /= A[:, :3].std(0) + 1e-9
-        weight = np.ones(len(tt))
-        r = np.zeros(len(tt))
-        for _ in range(5):  # an object half out of view is an outlier
-            c, *_ = np.linalg.lstsq(A * weight[:, None], q * weight[:, None], rcond=None)
-            r = np.linalg.norm(q - A @ c, axis=1)
-            weight = 1 / np.sqrt(1 + (r / (3 * np.median(r) + 1e-9)) ** 2)
-        return float(np.mean(np.minimum(r, 6 * np.median(r) + 1e-9) ** 2))
-
-    tried = np.arange(-max_offset_s, max_offset_s + 1e-9, 0.005)
-    costs = np.array([cost(s) for s in tried])
+    tried = np.arange(-max_offset_s, max_offset_s + 1e-9, STEP_S)
+    costs = np.array([_misfit(spline(tt + s), q) for s in tried])
     k = int(np.argmin(costs))
     if k in (0, len(tried) - 1):
         raise ScanError(
@@ -113,12 +99,26 @@ def estimate_time_offset(
     floor = max(float(c - b * b / (4 * a)), 1e-12)
     # cost = mean of two coordinates' squares, of M points less 8 fitted numbers
     sigma = float(np.sqrt(floor / (2 * max(len(tt) - 4, 1)) / a))
-    return TimeOffset(offset, sigma, float(np.sqrt(floor)), len(tt), tried, np.sqrt(costs))
+    return TimeOffset(offset, sigma, float(np.sqrt(floor)), len(tt))
+
+
+def _misfit(p: Float, q: Float) -> float:
+    """Mean square px of a track q (M, 2) about the best linear function of p (M, 3), outliers capped."""
+    A = np.column_stack([p, np.ones(len(q))])
+    A[:, :3] -= A[:, :3].mean(0)
+    A[:, :3] /= A[:, :3].std(0) + 1e-9
+    weight = np.ones(len(q))
+    r = np.zeros(len(q))
+    for _ in range(5):  # an object half out of view is an outlier
+        c, *_ = np.linalg.lstsq(A * weight[:, None], q * weight[:, None], rcond=None)
+        r = np.linalg.norm(q - A @ c, axis=1)
+        weight = 1 / np.sqrt(1 + (r / (3 * np.median(r) + 1e-9)) ** 2)
+    return float(np.mean(np.minimum(r, 6 * np.median(r) + 1e-9) ** 2))
 
 
 def warm_centroid(thermal: NDArray, *, share: float = 0.5) -> Float:
-    """(2,) px of the warm object: centroid of what is above the middle between background and the hottest; NaN if the
-    picture has no clear one, or it touches the border."""
+    """(2,) px of the warm object in a picture (H, W): centroid of what is above the middle between background and the
+    hottest; NaN if the picture has no clear one, or it touches the border."""
     x = cv2.GaussianBlur(np.asarray(thermal, np.float32), (0, 0), 1.0)
     base, top = float(np.median(x)), float(np.percentile(x, 99.9))
     spread = mad_sigma(x - base) + 1e-9
@@ -134,8 +134,8 @@ def warm_centroid(thermal: NDArray, *, share: float = 0.5) -> Float:
 
 
 def nearest_centroid(depth_m: NDArray, camera: Camera) -> Float:
-    """(3,) m of the object nearest to the depth camera: centroid of what lies within 8 cm behind its front; NaN if the
-    image is empty or the object touches the border."""
+    """(3,) m of the object nearest to the depth camera in an image (H, W): centroid of what lies within 8 cm behind its
+    front; NaN if the image is empty or the object touches the border."""
     z = np.asarray(depth_m, np.float64)
     if np.isfinite(z).sum() < 50:
         return np.full(3, np.nan)

@@ -16,16 +16,14 @@ from numpy.typing import NDArray
 
 from ...types import Float
 
-FIELD_SHAPE = (
-    4,
-    5,
-)  # control values down and across: the scale of a structured-light camera's bending, about 1/4 image
+FIELD_SHAPE = (4, 5)  # control values down and across: a structured-light camera bends over about 1/4 image
+FIELD = slice(2, None)  # part of MetricDepth's parameters, after scale and offset_m
 
 
 def field_basis(u_px: Float, v_px: Float, size: tuple[int, int], shape: tuple[int, int] = FIELD_SHAPE) -> Float:
     """(N, rows·columns) weights of a smooth field's control values: tensor product of piecewise linear hats.
 
-    size = (width, height) of the image. Rows sum to 1.
+    u_px, v_px : (N,). size = (width, height) of the image. Rows sum to 1.
     """
 
     def hats(x: Float, n: int, length: int) -> Float:
@@ -54,9 +52,11 @@ class MetricDepth:
     )
 
     def start(self) -> Float:
+        """(P,) scale [1], offset [m] and field [m per m²] of a camera that is right: zeros."""
         return np.zeros(len(self.names))
 
     def prior_sigma(self) -> Float:
+        """(P,) one sigma of the parameters about `start`: scale [1], offset [m], field [m per m²]."""
         return np.array([self.sigma_scale, self.sigma_offset_m] + [self.sigma_field] * (len(self.names) - 2))
 
     def _basis(self, z: Float, u_px: Float, v_px: Float) -> Float:
@@ -66,19 +66,22 @@ class MetricDepth:
     def residual(
         self, theta: Float, value: Float, u_px: Float, v_px: Float, z_plane: Float
     ) -> tuple[Float, Float, Float]:
-        """(N,) corrected depth minus plane [m], its derivative by theta (N, P) and by z_plane (N,)."""
+        """(N,) corrected depth minus plane [m], its derivative by theta (N, P) and by z_plane (N,).
+
+        theta : (P,). value : (N,) m, reported at u_px, v_px (N,). z_plane : (N,) m.
+        """
         B = self._basis(value, u_px, v_px)
         return value + B @ theta - z_plane, B, -np.ones(len(value))
 
     def to_depth_m(self, theta: Float, value: NDArray, u_px: NDArray, v_px: NDArray) -> Float:
-        """True depth along z of reported depth (N,), metres."""
+        """True depth (N,) along z, m, of reported `value` (N,), m, at u_px, v_px (N,), by parameters theta (P,)."""
         z = np.asarray(value, np.float64)
         return z + self._basis(z, u_px, v_px) @ theta
 
     def of_images(self, theta: Float) -> Callable[[NDArray], NDArray[np.float32]]:
-        """`to_depth_m` for whole images (H, W) of metres, NaN none."""
+        """`to_depth_m` by parameters theta (P,) for whole images (H, W), m, NaN none."""
         w, h = self.size
         v, u = np.mgrid[0:h, 0:w].reshape(2, -1)
-        bend = (field_basis(u, v, self.size) @ theta[2:]).astype(np.float32).reshape(h, w)
+        bend = (field_basis(u, v, self.size) @ theta[FIELD]).astype(np.float32).reshape(h, w)
         gain, offset = np.float32(1 + theta[0]), np.float32(theta[1])
         return lambda z: np.asarray(z * (gain + z * bend) + offset, np.float32)

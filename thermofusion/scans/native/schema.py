@@ -138,18 +138,28 @@ class RigCamerasDoc(Border):
     thermal: RigThermalDoc | None = None
 
 
+class RigExtrinsicsDoc(ExtrinsicsDoc):
+    """`extrinsics` of a rig.json; a rig calibrated without a depth camera hangs on the colour camera."""
+
+    T_thermal_color: list[list[float]] | None = None
+
+
 class DepthCorrectionDoc(Border):
-    """What calibration found of the depth camera's own error (`calibration.depth_model`)."""
+    """What calibration found of the depth camera's own error (`calibration.fit.depth_model`)."""
 
     model: Literal["metric", "disparity"]
     parameters: dict[str, float]
 
 
 class RigDoc(Border):
-    """rig.json: the `cameras` and `extrinsics` groups of a scan.json, each camera optional; the depth's correction."""
+    """rig.json: the `cameras` and `extrinsics` groups of a scan.json, each camera optional; the depth's correction.
+
+    covariances : (6, 6) by extrinsic and (9, 9) by camera, as `calibrate` found them.
+    """
 
     cameras: RigCamerasDoc
-    extrinsics: ExtrinsicsDoc = ExtrinsicsDoc()
+    extrinsics: RigExtrinsicsDoc = RigExtrinsicsDoc()
+    covariances: dict[str, list[list[float]]] = Field(default_factory=dict)
     depth_correction: DepthCorrectionDoc | None = None
 
 
@@ -181,7 +191,7 @@ def _extrinsic(extrinsics: ExtrinsicsDoc, name: str, path: Path) -> np.ndarray:
 
 
 def matrix_of(rows: list[list[float]], key: str, path: Path) -> np.ndarray:
-    """A 4x4 matrix of a JSON list."""
+    """A transform (4, 4), rotation and translation [m], of a JSON list. Raises ScanError that names the key."""
     if [len(r) for r in rows] != [4] * 4:
         raise ScanError(f"key '{key}': expected a 4x4 matrix", place=path)
     return np.array(rows, np.float64)
