@@ -43,8 +43,11 @@ def replacing(path: str | Path) -> Iterator[Path]:
 def write_whole(path: str | Path, chunks: Iterable[bytes | NDArray]) -> Path:
     """Write chunks, bytes and arrays of any shape and dtype, one after another in C order; returns the path.
 
-    Arrays go as they lie in memory: in the unit and byte order the caller gave them. Raises ResourceError.
+    Arrays go as they lie in memory: in the unit and byte order the caller gave them. The folder must exist: a mistyped
+    one is not made. Raises ResourceError.
     """
+    if not Path(path).parent.is_dir():
+        raise ResourceError("it cannot be written: there is no such folder", place=path)
     with replacing(path) as temporary, temporary.open("wb") as f:
         for chunk in chunks:
             if isinstance(chunk, np.ndarray):
@@ -55,8 +58,10 @@ def write_whole(path: str | Path, chunks: Iterable[bytes | NDArray]) -> Path:
 
 
 def write_text(path: str | Path, text: str) -> Path:
-    """Write a text file in UTF-8; returns the path. Raises ResourceError."""
-    return write_whole(path, [text.encode()])
+    """Write a text file in UTF-8, its folder made; returns the path. Raises ResourceError."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(text.encode())
+    return Path(path)
 
 
 def probe(folder: Path) -> None:
