@@ -65,7 +65,9 @@ def _to_truth(out):
 
 def test_a_result_folder_is_complete(demo):
     out, _ = demo
-    names = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file() and "stages" not in p.parts}
+    files = [p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file() and "stages" not in p.parts]
+    names = set(files) - {".thermofusion.lock"}
+    assert names == set(json.loads((out / "result.json").read_text())["files"])
     views = {f"views/{v}.png" for v in ("front", "back", "left", "right", "overview")}
     assert names == {
         *("mesh.ply", "mesh.glb", "mesh.vtp", "trajectory.txt", "result.json", "result.npz", "recipe.resolved.toml"),
@@ -105,10 +107,11 @@ def test_export_writes_other_formats_palettes_and_modes(demo, tmp_path, capsys):
         capsys, *("export", out, "-o", tmp_path, "--format", "ply,csv", "--show", "apparent", "--range", "28:36")
     )
     assert code == 0
-    mesh = read_mesh(tmp_path / "mesh.ply")
+    mesh = read_mesh(tmp_path / "mesh-apparent.ply")
     assert mesh.mode == "apparent"
     np.testing.assert_array_equal(mesh.temperature_degC, read_mesh(out / "mesh.ply").apparent_degC)
-    assert (tmp_path / "mesh.csv").is_file()
+    assert (tmp_path / "mesh-apparent.csv").is_file()
+    assert read_mesh(out / "mesh.ply").mode == "absolute"
 
 
 @pytest.mark.parametrize(
@@ -146,7 +149,7 @@ def test_doctor_recipe_and_check_answer(capsys):
     assert {"python", "open3d loads", "memory"} <= {f["subject"] for f in json.loads(text)}
     code, text, _ = call(capsys, "recipe", "show", "torso")
     assert code == 0
-    assert tomllib.loads(text)["emissivity"]["model"] == "dielectric"
+    assert tomllib.loads(text)["temperature"]["emissivity"]["model"] == "dielectric"
     code, text, _ = call(capsys, "recipe", "show", "torso", "--source")
     assert text.startswith("# torso")
     code, text, _ = call(capsys, "check", data_dir() / "demo", "--json")

@@ -153,9 +153,9 @@ def test_names_are_the_agreed_ones(tmp_path):
 
 
 def test_export_writes_the_folder(tmp_path):
-    mesh, trajectory = result(), Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1)))
-    paths = export(mesh, tmp_path / "a/b", ("ply", "glb", "vtp", "csv"), palette="iron", trajectory=trajectory)
-    assert {p.name for p in paths} == {"mesh.ply", "mesh.glb", "mesh.vtp", "mesh.csv", "trajectory.txt"}
+    mesh = result()
+    paths = export(mesh, tmp_path / "a/b", ("ply", "glb", "vtp", "csv"), palette="iron")
+    assert {p.name for p in paths} == {"mesh.ply", "mesh.glb", "mesh.vtp", "mesh.csv"}
     assert sorted(p.name for p in (tmp_path / "a/b").iterdir()) == sorted(p.name for p in paths)
     assert_same(read_mesh(tmp_path / "a/b"), mesh)
     for arguments in ({"formats": ["obj"]}, {"palette": "jet"}, {"range_degC": (36.0, 30.0)}):

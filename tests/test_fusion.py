@@ -34,8 +34,8 @@ LENS = Camera(
     320, 240, np.array([[260.0, 0, 158.0], [0, 262.0, 121.0], [0, 0, 1]]), np.array([0.05, -0.1, 1e-3, -8e-4, 0])
 )
 NOISE = 1.425e-3  # m at 1 m, Kinect v1
-RECIPE = {"fusion": {"voxel_mm": 4, "normal_window_mm": 30}, "subject": {"min_component_cm2": 20}}
-COARSE = {**RECIPE, "fusion": {"voxel_mm": 10}, "input": {"max_depth_m": 2.7}}
+RECIPE = {"surface": {"voxel_mm": 4, "normal_window_mm": 30}, "subject": {"min_component_cm2": 20}}
+COARSE = {**RECIPE, "surface": {"voxel_mm": 10}, "input": {"max_depth_m": 2.7}}
 
 
 # ---------------------------------------------------------------- shapes: nearest distance along rays, inf = missed
@@ -118,7 +118,7 @@ def fuse(images, poses, recipe=None, camera=CAMERA, **more):
 
 def fuse_along(scan, trajectory, recipe, floor_plane=None):
     tracked, recipe = SimpleNamespace(trajectory=trajectory, floor_plane=floor_plane), load_recipe(recipe)
-    return fuse_surface(scan, tracked, input=recipe.input, subject=recipe.subject, surface=recipe.fusion)
+    return fuse_surface(scan, tracked, input=recipe.input, subject=recipe.subject, surface=recipe.surface)
 
 
 def closed(mesh):
@@ -173,7 +173,7 @@ def test_no_memory_to_begin_with_costs_no_surface(ball) -> None:
     frames: Frames = DepthFrames(scan, recipe.input)
     placed = depth_poses(scan, Trajectory(scan.depth.times_s, poses), 0.5)
     survey = survey_depth(scan, frames, placed)
-    sections = {"input": recipe.input, "surface": recipe.fusion}
+    sections = {"input": recipe.input, "surface": recipe.surface}
     plan = plan_grid(scan, survey, **sections)
     grid, _ = integrate_frames(survey, frames, placed, replace(plan, blocks=1), **sections)
     V, F = canonical(*grid.extract(3))
@@ -265,12 +265,12 @@ def test_the_subject_is_what_was_looked_at_not_what_is_largest() -> None:
 def test_memory_bounds_the_grid_and_the_message_says_so(ball) -> None:
     images, poses, free = ball
     bound = free.memory_gib / 3
-    result = fuse(images, poses, {**RECIPE, "fusion": {"voxel_mm": 4, "max_memory_gib": bound}})
+    result = fuse(images, poses, {**RECIPE, "surface": {"voxel_mm": 4, "max_memory_gib": bound}})
     assert result.memory_gib <= bound
     assert result.voxel_m > free.voxel_m
     assert any("max_memory_gib" in m for m in result.messages)
     with pytest.raises(ResourceError, match="GiB"):
-        fuse(images, poses, {**RECIPE, "fusion": {"voxel_mm": 4, "max_memory_gib": 1e-5}})
+        fuse(images, poses, {**RECIPE, "surface": {"voxel_mm": 4, "max_memory_gib": 1e-5}})
 
 
 def test_a_frame_that_tracking_lost_is_not_interpolated(ball) -> None:

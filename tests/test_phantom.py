@@ -427,7 +427,7 @@ def reduced(name, scale=0.5, **shape):
 
 @pytest.mark.parametrize(
     ("name", "recipe", "overrides"),
-    [("cylinder", "phantom-cylinder", ()), ("sphere", "torso", ("radiometry.reflected_degC=20",))],
+    [("cylinder", "phantom-cylinder", ()), ("sphere", "torso", ("temperature.reflected_degC=20",))],
 )
 def test_isothermal_phantom_is_uniform_after_correction(name, recipe, overrides, tmp_path):
     """Single observations, corrected for offset, field, ε(θ) and room, must not depend on the viewing angle: less than
@@ -436,9 +436,9 @@ def test_isothermal_phantom_is_uniform_after_correction(name, recipe, overrides,
     scan = open_scan(simulate(config, tmp_path / "scan", seed=2))
     settings = load_recipe(recipe, overrides)
     result = fuse(scan, settings)
-    rows, calibration = result.seen.observations, result.temperature.calibration
+    rows, calibration = result.mapped.observations, result.temperature.calibration
     band = SolverBand(*scan.thermal.camera.band_um)
-    eps = calibration.emissivity(model_from_recipe(settings.emissivity, band))(rows.cos_angle)
+    eps = calibration.emissivity(model_from_recipe(settings.temperature.emissivity, band))(rows.cos_angle)
     room = band.radiance(273.15 + config.room.reflected_degC)
     corrected = band.temperature_K((calibration.corrected(rows) - (1 - eps) * room) / eps)
     apparent = band.temperature_K(rows.radiance)
@@ -467,7 +467,7 @@ def test_skin_that_sees_skin_is_not_biased(tmp_path):
     config = reduced("folds", scale=1.0, subdivisions=1)
     root = simulate(config, tmp_path / "scan", seed=2)
     truth = np.load(root / "truth" / "surface.npz")
-    mesh = fuse(open_scan(root), load_recipe("torso")).mesh
+    mesh = fuse(open_scan(root), load_recipe("torso")).mesh_in_world
     gap, nearest = cKDTree(truth["vertices_m"]).query(mesh.surface.vertices_m)
     error = mesh.temperature_degC - truth["temperature_degC"][nearest]
     good = np.isfinite(error) & (gap < 0.008) & (mesh.view_angle_deg < 60)

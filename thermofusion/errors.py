@@ -56,9 +56,3 @@ class ResourceError(ThermofusionError):
     """Memory, disk or a device is not sufficient or not there."""
 
     exit_code = 5
-
-
-class BatchError(ThermofusionError):
-    """Some scans of a batch failed; the others are done."""
-
-    exit_code = 6

@@ -99,7 +99,7 @@ class SurfaceSection(_Section):
     )
     smooth_iterations: int = Field(0, ge=0, le=1000, description="Taubin smoothing steps of the mesh")
     max_memory_gib: float = Field(
-        2.0, ge=0.001, le=1024, description="bound on the voxel grid's memory; the voxel grows to meet it"
+        2.0, ge=1e-5, le=1024, description="bound on the voxel grid's memory; the voxel grows to meet it"
     )
     color: bool = Field(True, description="colour the surface from the colour camera")
 
@@ -233,6 +233,7 @@ class QualitySection(_Section):
     min_tracked_fraction: float = Field(0.8, ge=0, le=1)
     min_coverage: float = Field(0.5, ge=0, le=1, description="share of the surface with a temperature")
     max_median_sigma_K: float = Field(0.5, gt=0, le=100)
+    max_voxel_mm: float = Field(15.0, ge=0.5, le=100, description="coarser voxels than asked for, to save memory")
 
 
 # Where keys of earlier recipes went, the more particular first. They are accepted, with a note.

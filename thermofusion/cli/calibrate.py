@@ -2,36 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass
 from datetime import datetime
-from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from ..errors import RecipeError
 from .console import emit, progress
+from .options import spelled_out
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 PICTURES_IN_REPORT = 12  # all of them lie inside the page
-
-
-def spelled_out(verb: Callable[..., None]) -> Callable[..., None]:
-    """A verb for typer: a parameter that is a dataclass becomes its fields, an option each."""
-    own = signature(verb, eval_str=True).parameters
-    kinds: dict[str, Any] = {n: p.annotation for n, p in own.items() if is_dataclass(p.annotation)}
-    bundles = {n: signature(kind, eval_str=True).parameters for n, kind in kinds.items()}
-
-    def flat(**given: Any) -> None:
-        packed = {n: kinds[n](**{k: given.pop(k) for k in fields}) for n, fields in bundles.items()}
-        verb(**given, **packed)
-
-    spelled = [p for n in own for p in (bundles[n].values() if n in bundles else [own[n]])]
-    flat.__signature__ = Signature([p.replace(kind=Parameter.KEYWORD_ONLY) for p in spelled])  # type: ignore[attr-defined]
-    flat.__name__, flat.__doc__ = verb.__name__, verb.__doc__
-    return flat
 
 
 def register(app: typer.Typer) -> None:

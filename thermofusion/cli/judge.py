@@ -8,12 +8,12 @@ from typing import Annotated
 import typer
 
 from .console import emit, note, progress
-from .options import Json, Processing, Recording, unfolded
+from .options import Json, Processing, Recording, spelled_out
 
 
 def register(app: typer.Typer) -> None:
     """Add this module's verbs."""
-    app.command()(unfolded(validate))
+    app.command()(spelled_out(validate))
     app.command()(compare)
 
 

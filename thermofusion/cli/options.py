@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
-import functools
-import inspect
 from collections.abc import Callable
+from dataclasses import dataclass, is_dataclass
+from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
@@ -17,11 +16,12 @@ if TYPE_CHECKING:
     from ..recipe import Recipe
     from ..types import Scan
 
+T = TypeVar("T")
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Overrides = Annotated[list[str] | None, typer.Option("--set", help="section.key=value, over the recipe; repeatable")]
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Recording:
     """A scan and its format."""
 
@@ -35,7 +35,7 @@ class Recording:
         return open_scan(self.scan, format=self.format)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Processing:
     """A recipe and what goes over it."""
 
@@ -61,28 +61,17 @@ class Processing:
         return load_recipe(self.recipe, overrides, note=note)
 
 
-def unfolded(verb: Callable[..., Any]) -> Callable[..., Any]:
-    """A verb as typer sees it: each bundle among its parameters replaced by the bundle's own options."""
-    hints = get_type_hints(verb, include_extras=True)
-    bundles: dict[str, Any] = {name: hint for name, hint in hints.items() if dataclasses.is_dataclass(hint)}
-    flat: list[inspect.Parameter] = []
-    for name, parameter in inspect.signature(verb).parameters.items():
-        if name not in bundles:
-            flat.append(parameter.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY))
-            continue
-        own = get_type_hints(bundles[name], include_extras=True)
-        for field in dataclasses.fields(bundles[name]):
-            default = inspect.Parameter.empty if field.default is dataclasses.MISSING else field.default
-            kind = inspect.Parameter.KEYWORD_ONLY
-            flat.append(inspect.Parameter(field.name, kind, default=default, annotation=own[field.name]))
+def spelled_out(verb: Callable[..., T]) -> Callable[..., T]:
+    """A verb for typer: a parameter that is a dataclass becomes its fields, an option each."""
+    own = signature(verb, eval_str=True).parameters
+    kinds: dict[str, Any] = {n: p.annotation for n, p in own.items() if is_dataclass(p.annotation)}
+    bundles = {n: signature(kind, eval_str=True).parameters for n, kind in kinds.items()}
 
-    @functools.wraps(verb)
-    def call(**given: Any) -> Any:
-        for name, bundle in bundles.items():
-            given[name] = bundle(**{f.name: given.pop(f.name) for f in dataclasses.fields(bundle)})
-        return verb(**given)
+    def flat(**given: Any) -> T:
+        packed = {n: kinds[n](**{k: given.pop(k) for k in fields}) for n, fields in bundles.items()}
+        return verb(**given, **packed)
 
-    required_first = sorted(flat, key=lambda p: p.default is not inspect.Parameter.empty)
-    call.__signature__ = inspect.Signature(required_first)  # type: ignore[attr-defined]
-    call.__annotations__ = {p.name: p.annotation for p in flat}
-    return call
+    spelled = [p for n in own for p in (bundles[n].values() if n in bundles else [own[n]])]
+    flat.__signature__ = Signature([p.replace(kind=Parameter.KEYWORD_ONLY) for p in spelled])  # type: ignore[attr-defined]
+    flat.__name__, flat.__doc__ = verb.__name__, verb.__doc__
+    return flat

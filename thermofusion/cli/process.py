@@ -9,14 +9,14 @@ import typer
 
 from ..errors import QualityError
 from .console import emit, low_high, named, note, progress
-from .options import Json, Processing, Recording, unfolded
+from .options import Json, Processing, Recording, spelled_out
 
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what stands in the result folder.")]
 
 
 def register(app: typer.Typer) -> None:
     """Add this module's verbs."""
-    app.command()(unfolded(run))
+    app.command()(spelled_out(run))
     app.command()(demo)
     app.command()(export)
 

@@ -12,8 +12,8 @@ import typer
 
 from ..errors import RecipeError, ScanError
 from ..progress import Progress
-from .calibrate import spelled_out
 from .console import emit, low_high, note, progress
+from .options import spelled_out
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

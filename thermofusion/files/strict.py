@@ -27,6 +27,12 @@ class Border(BaseModel):
     model_config = ConfigDict(extra="allow", allow_inf_nan=False)
 
 
+class ClosedBorder(BaseModel):
+    """A group of a document in which an unknown key is an error."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
 def validated(model: type[Doc], tree: object, place: object, hint: str | None = None) -> Doc:
     """`tree` (decoded JSON or TOML) as `model`. Raises ScanError that names the first faulty key."""
     try:

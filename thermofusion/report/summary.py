@@ -56,7 +56,7 @@ def result_report(scan: Scan, recipe: Recipe, steps: Steps, reused: Sequence[str
     if steps.temperature is not None:
         report["temperature"] = _temperature(steps.temperature)
         messages += steps.temperature.messages
-    report["quality"] = _quality(recipe, scan, steps.tracking, steps.temperature)
+    report["quality"] = _quality(recipe, scan, steps)
     report["messages"] = messages
     report["stages_reused"] = list(reused)
     return report
@@ -184,10 +184,16 @@ def _temperature(t: Temperature) -> dict[str, Any]:
     }
 
 
-def _quality(recipe: Recipe, scan: Scan, tracking: TrackingResult, temperature: Temperature | None) -> dict[str, Any]:
+def _quality(recipe: Recipe, scan: Scan, steps: Steps) -> dict[str, Any]:
     """The recipe's gate: each figure, its bound, and what failed."""
-    gate, failed = recipe.quality, []
-    tracked = float(tracking.tracked.mean())
+    gate, asked_mm, failed = recipe.quality, recipe.surface.voxel_mm, []
+    temperature, tracked = steps.temperature, float(steps.tracking.tracked.mean())
+    voxel_mm = 0.0 if steps.surface is None else 1e3 * steps.surface.voxel_m
+    if voxel_mm > max(gate.max_voxel_mm, 0.0 if asked_mm == "auto" else 1.01 * asked_mm):
+        bound = f"max_memory_gib = {recipe.surface.max_memory_gib:g}"
+        failed.append(
+            f"voxels grew to {voxel_mm:.0f} mm to keep {bound}, the recipe allows {gate.max_voxel_mm:g} mm"
+        )
     if tracked < gate.min_tracked_fraction:
         failed.append(f"{tracked:.0%} of the depth frames are tracked, the recipe asks {gate.min_tracked_fraction:.0%}")
     figures: dict[str, Any] = {"tracked_fraction": tracked}

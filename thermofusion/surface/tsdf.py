@@ -273,9 +273,14 @@ class VoxelGrid:
         if self._enlarge > 1:
             fine = cv2.resize(depth, None, fx=self._enlarge, fy=self._enlarge, interpolation=cv2.INTER_NEAREST)
         image = self._o3d.t.geometry.Image(core.Tensor(fine))
-        return self._grid.compute_unique_block_coordinates(
-            image, self._K_touch, extrinsic, 1.0, self._plan.max_range_m, self._multiplier + 1
-        )
+        try:
+            return self._grid.compute_unique_block_coordinates(
+                image, self._K_touch, extrinsic, 1.0, self._plan.max_range_m, self._multiplier + 1
+            )
+        except RuntimeError as e:
+            if "No block is touched" not in str(e):
+                raise
+            return core.Tensor(np.zeros((0, 3), np.int32))  # depth too scattered for Open3D's sparse look at it
 
 
 def integrate_frames(
