@@ -1,5 +1,54 @@
-"""`python -m thermofusion`."""
+"""The program: Ctrl-C is in hand before anything slow is imported, and ends in one sentence wherever it strikes."""
 
-from .cli import main
+from __future__ import annotations
 
-main()
+import os
+import signal
+import sys
+from typing import Any
+
+INTERRUPTED = 130
+SENTENCE = "interrupted; what was computed is kept and the next run continues from there"
+
+
+def main() -> None:
+    """Entry point of `thermofusion` and `python -m thermofusion`."""
+    asked: list[int] = []
+
+    def stop(number: int, frame: Any) -> None:
+        asked.append(number)
+        raise KeyboardInterrupt
+
+    def unraisable(told: Any) -> None:  # an interrupt inside a destructor or a thread would be swallowed
+        if asked:
+            _end()
+        sys.__unraisablehook__(told)
+
+    signal.signal(signal.SIGINT, stop)
+    sys.unraisablehook = unraisable
+    try:
+        from .cli import main as run
+
+        run()
+    except SystemExit:
+        raise
+    except BaseException:  # half-imported libraries turn an interrupt into errors of their own
+        if asked:
+            _end()
+        raise
+
+
+def _end() -> None:
+    """One sentence, past whatever hangs: threads, buffers, bars."""
+    words = f"error: {SENTENCE}\n".encode()
+    for stream, text in ((1, b'{"error": "interrupted", "exit_code": 130}\n'), (2, words)):
+        try:
+            if stream == 2 or "--json" in sys.argv:
+                os.write(stream, (b"\x1b[?25h" if os.isatty(stream) else b"") + text)  # a live bar hides the cursor
+        except OSError:
+            pass
+    os._exit(INTERRUPTED)
+
+
+if __name__ == "__main__":
+    main()

@@ -6,22 +6,23 @@ verbs, so that `--help` answers at once.
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 
 # Our matrices are many and small, and stages bring their own threads: BLAS threads would only wait for each other
-# (twice the CPU time on two cores), and sums would depend on their number. Must be set before NumPy is loaded.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-os.environ.setdefault("MKL_NUM_THREADS", "1")
+# (twice the CPU time on two cores), and sums would depend on their number, whatever a user's environment says. Must be
+# set before NumPy is loaded.
+for library in ("OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM"):
+    os.environ[f"{library}_NUM_THREADS"] = "1"
 
 import typer
 
+from ..__main__ import INTERRUPTED, SENTENCE
 from ..errors import ThermofusionError
 from ..version import __version__
 from . import calibrate, inspect, judge, paper, process, recordings, thermal
-from .console import fail
-
-INTERRUPTED = 130
+from .console import READER_GONE, fail, leave
 
 app = typer.Typer(
     name="thermofusion",
@@ -53,14 +54,20 @@ def main(argv: list[str] | None = None) -> None:
     except ThermofusionError as e:
         fail(e.sentence(), e.exit_code, as_json)
     except (KeyboardInterrupt, typer.Abort):
-        fail("interrupted; what was computed is kept and the next run continues from there", INTERRUPTED, as_json)
+        fail(SENTENCE, INTERRUPTED, as_json)
     except MemoryError:
         fail("out of memory; choose a larger surface.voxel_mm or a smaller --max-memory", 5, as_json)
+    except OSError as e:  # a stream that is full or gone, a folder that was refused
+        if e.errno == errno.EPIPE:
+            leave(READER_GONE)
+        fail(f"{e.filename or 'a stream'}: it cannot be used ({e.strerror})", 5, as_json)
     except Exception as e:
         if hasattr(e, "format_message"):  # a usage error of the command line itself
             fail(f"{e.format_message()} (see --help)", 2, as_json)
         raise
-    sys.exit(code if isinstance(code, int) else 0)
+    if code == INTERRUPTED:  # typer's own word for Ctrl-C
+        fail(SENTENCE, INTERRUPTED, as_json)
+    leave(code if isinstance(code, int) else 0)
 
 
 __all__ = ["app", "main"]
