@@ -45,7 +45,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "paper": (*ALL, "judge", "phantom"),
     "cli": (*ALL, "judge", "calibration", "phantom", "paper"),
     "__init__": ALL,
-    "__main__": ("cli",),
+    "__main__": ("cli", "errors"),
 }
 # Sub-rooms of calibration: a board is printed, detected, fitted.
 CALIBRATION = {"board": (), "detect": ("board",), "fit": ("board", "detect"), "thermal": ()}

@@ -7,8 +7,7 @@ import signal
 import sys
 from typing import Any
 
-INTERRUPTED = 130
-SENTENCE = "interrupted; what was computed is kept and the next run continues from there"
+from .errors import INTERRUPTED, INTERRUPTED_SENTENCE
 
 
 def main() -> None:
@@ -40,7 +39,7 @@ def main() -> None:
 
 def _end() -> None:
     """One sentence, past whatever hangs: threads, buffers, bars."""
-    words = f"error: {SENTENCE}\n".encode()
+    words = f"error: {INTERRUPTED_SENTENCE}\n".encode()
     for stream, text in ((1, b'{"error": "interrupted", "exit_code": 130}\n'), (2, words)):
         try:
             if stream == 2 or "--json" in sys.argv:

@@ -8,6 +8,9 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+INTERRUPTED = 130  # exit code after Ctrl-C, as shells count it
+INTERRUPTED_SENTENCE = "interrupted; what was computed is kept and the next run continues from there"
+
 
 class ThermofusionError(Exception):
     """Root of all errors that a user can act on.

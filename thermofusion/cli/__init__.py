@@ -18,8 +18,7 @@ for library in ("OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM"):
 
 import typer
 
-from ..__main__ import INTERRUPTED, SENTENCE
-from ..errors import ThermofusionError
+from ..errors import INTERRUPTED, INTERRUPTED_SENTENCE, ThermofusionError
 from ..version import __version__
 from . import calibrate, inspect, judge, paper, process, recordings, thermal
 from .console import READER_GONE, fail, leave
@@ -54,7 +53,7 @@ def main(argv: list[str] | None = None) -> None:
     except ThermofusionError as e:
         fail(e.sentence(), e.exit_code, as_json)
     except (KeyboardInterrupt, typer.Abort):
-        fail(SENTENCE, INTERRUPTED, as_json)
+        fail(INTERRUPTED_SENTENCE, INTERRUPTED, as_json)
     except MemoryError:
         fail("out of memory; choose a larger surface.voxel_mm or a smaller --max-memory", 5, as_json)
     except OSError as e:  # a stream that is full or gone, a folder that was refused
@@ -66,7 +65,7 @@ def main(argv: list[str] | None = None) -> None:
             fail(f"{e.format_message()} (see --help)", 2, as_json)
         raise
     if code == INTERRUPTED:  # typer's own word for Ctrl-C
-        fail(SENTENCE, INTERRUPTED, as_json)
+        fail(INTERRUPTED_SENTENCE, INTERRUPTED, as_json)
     leave(code if isinstance(code, int) else 0)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
 import time
 from collections.abc import Iterator
@@ -13,13 +15,29 @@ from ..errors import RecipeError
 from ..files.json import to_json
 from ..progress import Progress
 
+READER_GONE = 141  # exit code when nobody reads any more, as shells count SIGPIPE
+
+
+def leave(code: int) -> NoReturn:
+    """Exit; a stream that cannot take what is left in it says so by the code, not by a traceback."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the work is done
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            if stream is not None:
+                stream.flush()
+        except (OSError, ValueError) as e:
+            if stream is sys.stdout:
+                code = READER_GONE if isinstance(e, BrokenPipeError) else code or 5
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1 if stream is sys.stdout else 2)
+    sys.exit(code)
+
 
 def fail(sentence: str, code: int, as_json: bool) -> NoReturn:
     """Print one sentence (or one JSON object) and exit with the code."""
     if as_json:
         print(to_json({"error": sentence, "exit_code": code}))
     print(f"error: {sentence}", file=sys.stderr)
-    sys.exit(code)
+    leave(code)
 
 
 def emit(value: object, text: str, as_json: bool) -> None:
