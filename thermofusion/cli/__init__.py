@@ -13,8 +13,7 @@ import sys
 # Our matrices are many and small, and stages bring their own threads: BLAS threads would only wait for each other
 # (twice the CPU time on two cores), and sums would depend on their number, whatever a user's environment says. Must be
 # set before NumPy is loaded.
-for library in ("OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM"):
-    os.environ[f"{library}_NUM_THREADS"] = "1"
+os.environ |= {f"{name}_NUM_THREADS": "1" for name in ("OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM")}
 
 import typer
 
