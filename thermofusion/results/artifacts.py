@@ -28,7 +28,10 @@ AGAIN = "run `thermofusion run` again"
 
 
 def save_artifact(path: Path, value: object, note: Mapping[str, Any] | None = None) -> None:
-    """Store a value, and a note (JSON) beside it in the same file. Raises ResourceError, TypeError."""
+    """Store a value, and a note (JSON) beside it in the same file; arrays bear their fields' names.
+
+    Raises ResourceError, TypeError.
+    """
     arrays: dict[str, np.ndarray] = {}
     tree = json.dumps(_pack(value, arrays))
     texts = {TREE: tree, NOTE: json.dumps(dict(note or {}))}
@@ -61,21 +64,24 @@ def load_note(path: Path) -> dict[str, Any]:
     return note
 
 
-def _pack(value: Any, arrays: dict[str, np.ndarray]) -> Any:
+def _pack(value: Any, arrays: dict[str, np.ndarray], path: str = "") -> Any:
+    """The tree of a value; its arrays under the names of the fields that lead to them."""
     if isinstance(value, np.ndarray):
-        arrays[f"a{len(arrays)}"] = value
-        return {"array": f"a{len(arrays) - 1}"}
+        arrays[path or "value"] = value
+        return {"array": path or "value"}
     if isinstance(value, Enum):
-        return _pack(value.value, arrays)
+        return _pack(value.value, arrays, path)
     if isinstance(value, np.generic):
         return value.item()
+    at = f"{path}." if path else ""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = {f.name: _pack(getattr(value, f.name), arrays) for f in dataclasses.fields(value) if f.init}
-        return {"type": name_of(value), "fields": fields}
+        names = [f.name for f in dataclasses.fields(value) if f.init]
+        return {"type": name_of(value), "fields": {n: _pack(getattr(value, n), arrays, at + n) for n in names}}
     if isinstance(value, tuple | list):
-        return {"tuple" if isinstance(value, tuple) else "list": [_pack(v, arrays) for v in value]}
+        items = [_pack(v, arrays, f"{at}{n}") for n, v in enumerate(value)]
+        return {"tuple" if isinstance(value, tuple) else "list": items}
     if isinstance(value, Mapping):
-        return {"dict": {str(k): _pack(v, arrays) for k, v in value.items()}}
+        return {"dict": {str(k): _pack(v, arrays, f"{at}{k}") for k, v in value.items()}}
     if isinstance(value, Path):
         return {"path": str(value)}
     if value is None or isinstance(value, bool | int | float | str):

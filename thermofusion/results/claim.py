@@ -19,6 +19,7 @@ from .stages import WORK, scan_id
 LOCK = ".thermofusion.lock"
 REPORT = "result.json"  # the file that makes a result: it comes last, and names all others
 VIEWS = "views"
+CHANGING = f"{WORK}/files.json"  # while files are changed over: whose they are, should the run be killed
 # What version 0.1.0 wrote without a list.
 UNLISTED = re.compile(
     r"(mesh\.(ply|glb|vtp|csv)|result\.npz|trajectory\.txt|recipe\.resolved\.toml|validation\.json|views/[\w.-]+\.png)$"
@@ -132,8 +133,11 @@ def _report(folder: Path) -> dict | None:
 
 def _listed(folder: Path) -> list[str]:
     report = _report(folder)
-    if report is None:
-        return []
+    if report is None:  # killed while it changed over?
+        try:
+            report = {"files": read_json(folder / CHANGING)}
+        except ScanError:
+            return []
     files = report.get("files")
     if isinstance(files, list):
         return [f for f in files if isinstance(f, str) and ".." not in Path(f).parts and not Path(f).is_absolute()]

@@ -18,7 +18,7 @@ from ..report.summary import Steps, result_report
 from ..types import Scan, ThermalMesh, Trajectory
 from ..version import __version__
 from .artifacts import load_artifact, save_artifact
-from .claim import REPORT, VIEWS, listed
+from .claim import CHANGING, REPORT, VIEWS, listed
 from .frame import WORLD, Frame, frame_of
 
 if TYPE_CHECKING:
@@ -106,7 +106,8 @@ def write_result(
                 )
         files = sorted(p.relative_to(new).as_posix() for p in new.rglob("*") if p.is_file())
         write_text(new / REPORT, to_json({**result.report, "files": [*files, REPORT]}))
-    for name in set(left) - {*files, REPORT}:
+        write_text(folder / CHANGING, to_json(sorted({*left, *files, REPORT})))
+    for name in {*left, CHANGING} - {*files, REPORT}:
         (folder / name).unlink(missing_ok=True)
 
 

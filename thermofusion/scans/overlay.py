@@ -52,7 +52,7 @@ def edge_overlays(scan: Scan, count: int = OVERLAY_FRAMES) -> list[Overlay]:
             grey = to_grey(stream.load(i))
             edges = _project_edges(scan.rig.depth, scan.depth.load(k), camera, T_other_depth)
             shift, contrast = best_shift(grey, edges)
-            picture = _draw(grey if name == "thermal" else stream.load(i), edges)
+            picture = _upright(_draw(grey if name == "thermal" else stream.load(i), edges), T[:3, :3] @ scan.depth_up)
             found.append(Overlay(f"overlay-{name}-{int(stream.index[i]):06d}", name, picture, shift, contrast))
     return found
 
@@ -134,3 +134,9 @@ def _draw(image: NDArray, edges_px: Float) -> UInt8:
     u, v = np.rint(edges_px).astype(int).T
     picture[v, u] = _GREEN
     return picture
+
+
+def _upright(picture: UInt8, up: Float) -> UInt8:
+    """A picture (H, W, 3) turned by quarters, so that a direction `up` (3,) of its camera points upward."""
+    turns = int(np.argmax([-up[1], up[0], up[1], -up[0]]))
+    return np.ascontiguousarray(np.rot90(picture, turns))
