@@ -1,11 +1,12 @@
 """CSV, one row per vertex, for spreadsheets and statistics: no triangles; an empty cell is unmeasured.
 
-Numbers are rounded far below what they are worth: positions to 1 µm, temperatures to 0.1 mK. `output_mode` and `level`
-stand in every row, so that rows of several results can be put together without mixing what they mean.
+Numbers are rounded far below what they are worth: positions to 1 µm, temperatures to 0.1 mK. `output_mode`, `level`,
+`scan` and `run` stand in every row, so that rows of several results can be put together without mixing them up.
 """
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from ..files.whole import write_whole
 from ..types import ThermalMesh
 from .columns import COLUMNS, TABLE_PART, check_mesh
 
-POSITION, NORMAL, WORDS = ("x_m", "y_m", "z_m"), ("nx", "ny", "nz"), ("output_mode", "level")
+POSITION, NORMAL, WORDS = ("x_m", "y_m", "z_m"), ("nx", "ny", "nz"), ("output_mode", "level", "scan", "run")
 
 
 def write_csv(path: str | Path, mesh: ThermalMesh) -> Path:
@@ -30,7 +31,8 @@ def write_csv(path: str | Path, mesh: ThermalMesh) -> Path:
         columns[c.field] = values, "%d" if values.dtype.kind in "iu" else "%.4f"
     columns |= {TABLE_PART.format(name): (values, "%.4f") for name, values in mesh.uncertainty_parts.items()}
     cells = [_cells(values, form) for values, form in columns.values()]
-    tail = f"{mesh.mode},{'anchored' if mesh.anchored else 'relative'}\n"
+    named = [re.sub(r'[",\s]+', " ", str(mesh.metadata.get(key, ""))) for key in ("scan", "run")]
+    tail = ",".join([mesh.mode, "anchored" if mesh.anchored else "relative", *named]) + "\n"
     rows = (f"{','.join(row)},{tail}" for row in zip(*cells, strict=True))
     return write_whole(path, [",".join([*columns, *WORDS]).encode() + b"\n", "".join(rows).encode()])
 

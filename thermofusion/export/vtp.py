@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
@@ -54,9 +55,12 @@ def write_vtp(
     data |= {} if surface.color_rgb is None else {SKIN: surface.color_rgb}
     description = describe(mesh, palette, color_range(mesh.temperature_degC, range_degC))
     text = " ".join(str(byte) for byte in json.dumps(description, allow_nan=False).encode() + b"\0")
+    told = f"scan {mesh.metadata.get('scan', '')}, run {mesh.metadata.get('run', '')}".replace("--", "- -")
+    told = "".join(c if c.isprintable() else "?" for c in told)  # a comment for people and grep; XML forbids some
     faces = len(surface.triangles)
     ends = np.arange(1, faces + 1, dtype=np.int32) * 3
     xml = f"""<?xml version="1.0"?>
+<!-- {told} -->
 {_HEAD}
 <PolyData>
 <FieldData><Array type="String" Name="{DESCRIPTION}" NumberOfTuples="1" format="ascii">{text}</Array></FieldData>
@@ -80,7 +84,7 @@ def read_vtp(path: str | Path) -> ThermalMesh:
     start = data.find(b"_", mark + len(_MARK)) + 1
     if mark < 0 or start == 0 or _HEAD.encode() not in data[:mark]:
         raise ScanError("the file is no VTP with appended raw data", place=path)
-    if b"<!" in data[:mark]:
+    if re.search(rb"<!(?!--)", data[:mark]):
         raise ScanError("the VTP's XML has declarations, which are not read", place=path)
     try:
         root = ET.fromstring(data[:mark] + b"</VTKFile>")
