@@ -50,7 +50,7 @@ class Processing:
         str | None, typer.Option(help="Side of the person in the first depth frame: auto, front, back, left, right.")
     ] = None
 
-    def load(self) -> Recipe:
+    def load(self, note: Callable[[str], None] = note) -> Recipe:
         """The recipe, a note for keys that have new names. Raises RecipeError."""
         from ..recipe import load_recipe
 

@@ -34,7 +34,8 @@ def run(
     """Fuse a recorded scan into a mesh with temperatures."""
     from .. import pipeline
 
-    chosen, scan = processing.load(), recording.open()
+    renamed: list[str] = []  # told last: before the work, errors speak
+    chosen, scan = processing.load(renamed.append), recording.open()
     if dry_run:
         plans = pipeline.plan(scan, chosen, out, redo_from=from_)
         emit(plans, "\n".join(f"{p.name:<12} {'reuse' if p.reuse else 'compute'}  ({p.why})" for p in plans), json)
@@ -44,6 +45,8 @@ def run(
             scan, chosen, out=named(out), progress=step, redo_from=from_, until=until, overwrite=overwrite
         )
     emit(result.report, pipeline.summary(result.report, out), json)
+    for line in renamed:
+        note(line)
     return QualityError.exit_code if result.report["quality"]["failed"] else 0
 
 

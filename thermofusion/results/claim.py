@@ -37,9 +37,11 @@ def claimed(folder: Path, scan: Scan, names: list[str], *, overwrite: bool = Fal
     _apart(folder, scan)
     with _locked(folder):
         left = _listed(folder)
+        _clear(folder, names)
         if not overwrite:
             _own(folder, scan, names, left)
-        _clear(folder, names)
+        probe(folder)
+        probe(folder / WORK)
         tidy(folder)
         yield left
 
@@ -112,15 +114,13 @@ def _own(folder: Path, scan: Scan, names: list[str], left: list[str]) -> None:
 
 
 def _clear(folder: Path, names: list[str]) -> None:
-    """Find what stands in the way of a file, and whether the disk takes one, before the work."""
+    """Find what stands in the way of a file before the work."""
     for part in (WORK, VIEWS):
         if (folder / part).exists() and not (folder / part).is_dir():
             raise ResourceError("a file stands where a folder of the result belongs", place=folder / part)
     for name in names:
         if (folder / name).is_dir():
             raise ResourceError("a folder stands where a file of the result belongs", place=folder / name)
-    probe(folder)
-    probe(folder / WORK)
 
 
 def _report(folder: Path) -> dict | None:
