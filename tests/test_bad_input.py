@@ -11,24 +11,26 @@ import shutil
 import struct
 import subprocess
 import sys
+import tracemalloc
 import zlib
-from contextlib import contextmanager
+from collections import deque
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from support import scan_maker as make
 from support.scan_maker import write_pnm
 
-from thermofusion.errors import ScanError
-from thermofusion.files.pnm import read_pnm
-from thermofusion.files.reading import decode_image
-from thermofusion.scans import open_scan
+from thermofusion.cli.console import emit, note
+from thermofusion.errors import ScanError, visible
+from thermofusion.files import reading
+from thermofusion.files.npz import read_npz
+from thermofusion.files.reading import parse_json, read_bytes
+from thermofusion.files.table import table_rows
+from thermofusion.scans import open_scan, with_rig
 from thermofusion.scans.check import verify
 from thermofusion.scans.native.write import write_scan
-from thermofusion.scans.thermal import flir
 
 
 @pytest.fixture(scope="session")
@@ -140,6 +142,14 @@ def all_depth(value):
     def spoil(root):
         for path in (root / "depth").iterdir():
             path.write_bytes(cv2.imencode(".png", np.full((48, 64), value, np.uint16))[1].tobytes())
+
+    return spoil
+
+
+def all_thermal(value):
+    def spoil(root):
+        for path in (root / "thermal").iterdir():
+            path.write_bytes(cv2.imencode(".png", np.full((40, 56), value, np.uint16))[1].tobytes())
 
     return spoil
 
@@ -283,6 +293,44 @@ FAULTS = {
     "pose of words": (trajectory("hello world\n"), "numbers only"),
     "poses run backwards": (trajectory("1 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n"), "run backwards"),
     "poses in millimetres": (trajectory("0 0 0 1500000 0 0 0 1\n"), "expected metres"),
+    "time in microseconds": (cell(0, "time_s", "1.7e15"), "times are in seconds"),
+    "more cells than columns": (
+        file("frames.csv", lambda b: b.replace(b".png,\n", b".png,,,\n", 1)),
+        "cells under 5 columns",
+    ),
+    "depth of one value": (all_depth(1000), "depth image is constant"),
+    "depth of one value but for its rim": (image(DEPTH, np.pad(np.full((46, 62), 900, np.uint16), 1)), "constant"),
+    "up without a length": (put("cameras.depth.up", [0, 0, 0]), "key 'cameras.depth.up': expected a direction"),
+    "noise of a kilokelvin": (put("cameras.thermal.netd_K", 1000), "expected 0.0001 to 5 K, got 1000"),
+    "no noise": (put("cameras.thermal.netd_K", 0), "expected 0.0001 to 5 K"),
+    "focal length of nothing": (put("cameras.depth.K", [[1e-9, 0, 32], [0, 60, 24], [0, 0, 1]]), "3.2 to 6400 px"),
+    "centre far off": (put("cameras.depth.K", [[60, 0, 1e9], [0, 60, 24], [0, 0, 1]]), "centre"),
+    "distortion of millions": (put("cameras.thermal.distortion", [1e6, 0, 0, 0, 0]), "distortion"),
+    "cameras in different towns": (
+        put("extrinsics.T_color_depth", [[1, 0, 0, 500], *np.eye(4)[1:].tolist()]),
+        "metres",
+    ),
+    "band of no width": (put("cameras.thermal.band_um", [8, 8.0000001]), "rise by at least"),
+    "curve of infinite counts": (put("cameras.thermal.signal.curve.coefficients_degC", [0, 1e300]), "expected -1e+12"),
+    "polygon outside": (
+        put("references.0.thermal_polygon_px", [[90, 1], [95, 1], [95, 5]]),
+        "beyond the thermal image",
+    ),
+    "polygon of no area": (put("references.0.thermal_polygon_px", [[5, 5]] * 3), "less than a pixel"),
+    "polygon far below": (
+        put("references.0.thermal_polygon_px", [[-1e30, 0], [9, 1], [9, 5]]),
+        "expected -0.5 to 32767 px",
+    ),
+    "reference of molten iron": (put("references.0.degC", 1500), "expected -50 to 150 °C, got 1500"),
+    "reference in no frame": (put("references.0.frames", []), "references.0.frames"),
+    "reference in frame 10^30": (put("references.0.frames", [10**30]), "references.0.frames"),
+    "reference in a frame that is not there": (put("references.0.frames", [77]), "names no thermal frame"),
+    "reference seen elsewhere": (put("references.0.degC", 149), "blackbody of 149 degC is seen at"),
+    "thermal of one value": (all_thermal(22000), "thermal image is constant"),
+    "contact on the moon": (put("references.1.p_world_m", [4e8, 0, 0]), "expected -1000 to 1000 m"),
+    "surroundings of hell": (put("environment.reflected_degC", 666), "expected -80 to 150 °C, got 666"),
+    "name of a novel": (put("name", "x" * 10_000), "key 'name'"),
+    "key twice": (file("scan.json", lambda b: b.replace(b"{", b'{"name": "other",', 1)), "'name' stands twice"),
     "no pose": (trajectory("# nothing\n"), "no poses"),
     "poses of another day": (trajectory("9e5 0 0 0 0 0 0 1\n"), "no time in common"),
 }
@@ -369,98 +417,97 @@ def test_fakenect_index(tmp_path, name, text, expected):
 
 
 def test_jhu_counts_of_another_size(tmp_path):
-    (tmp_path / "a.pgm").write_bytes(write_pnm(np.full((480, 640), 1200, np.uint16)))
+    (tmp_path / "a.pgm").write_bytes(write_pnm(np.arange(480 * 640, dtype=np.uint16).reshape(480, 640) % 500 + 1200))
     (tmp_path / "a_0000.raw").write_bytes(b"\0" * 1000)
     with pytest.raises(ScanError, match="expected 601664 bytes"):
         verify(open_scan(tmp_path))
 
 
-# ---------------------------------------------------------------- damaged bytes: only ScanError may come out
+# ---------------------------------------------------------------- one door for files, tables, JSON, archives
 
-FUZZ = settings(
-    max_examples=120,
-    derandomize=True,
-    deadline=None,
-    database=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
+
+def test_no_pipe_folder_or_dangling_link_is_waited_for_or_passed_over(root, tmp_path):
+    """Optional files, too: what has the name and is no file is said."""
+    for name in ("scan.json", "frames.csv", "trajectory.txt", "rig.json"):
+        for kind in (os.mkfifo, os.mkdir, lambda path: path.symlink_to("nothing")):
+            scan = shutil.copytree(root, tmp_path / "copy")
+            (scan / name).unlink(missing_ok=True)
+            kind(scan / name)
+            with pytest.raises(ScanError, match=r"regular file|link to nothing"):
+                with_rig(open_scan(scan), scan / "rig.json")
+            shutil.rmtree(scan)
+    os.mkfifo(tmp_path / "take.mkv")
+    with pytest.raises(ScanError, match="recognised"):
+        open_scan(tmp_path / "take.mkv")
+    with pytest.raises(ScanError, match="regular file"):
+        read_bytes(Path("/dev/zero"))
+
+
+def test_tables_take_little_memory(tmp_path, monkeypatch):
+    """A quoted cell without its end, and endless short ones, stop at a row's length; rows are not kept."""
+    head = "x_m,y_m,z_m,degC,uncertainty_K\n"
+    for row, match in (('"' + "0\n" * 90_000, "more than 100,000"), ('"a\n",' * 40_000, "more than 100,000")):
+        (tmp_path / "t.csv").write_text(head + row)
+        with pytest.raises(ScanError, match=match):
+            list(table_rows(tmp_path / "t.csv", "table", ["degC"]))
+    for text, match in ((head + "1,2,3,4,5,6\n", "6 cells under 5"), ("a,b,a\n1,2,3\n", "column a stands twice")):
+        (tmp_path / "t.csv").write_text(text)
+        with pytest.raises(ScanError, match=match):
+            list(table_rows(tmp_path / "t.csv", "table", ["a"] if text[0] == "a" else ["degC"]))
+    (tmp_path / "t.csv").write_text(head + "0,0,0,33\n" * 100_000)
+    tracemalloc.start()
+    deque(table_rows(tmp_path / "t.csv", "table", ["degC"]), maxlen=0)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2e6
+    monkeypatch.setattr(reading, "MAX_LINES", 1000)
+    with pytest.raises(ScanError, match="more than 1,000 lines"):
+        deque(table_rows(tmp_path / "t.csv", "table", ["degC"]), maxlen=0)
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ('{"a": 1, "b": {"c": 1, "c": 2}}', "key 'c' stands twice"),
+        ("[1, NaN]", "NaN stands where a finite"),
+        ("[-1e999]", "finite number"),
+        ('{"a": -Infinity}', "finite number"),
+        ("[" * 65 + "]" * 65, "nested too deep"),
+        ("[" * 100_000, "nested too deep"),
+        ('["\\ud800"]', "half a character"),
+        ("[" + "9" * 5000 + "]", "too many digits"),
+    ],
 )
+def test_json_that_python_would_let_pass(text, match):
+    with pytest.raises(ScanError, match=match):
+        parse_json(text, "x")
+    assert parse_json("[" * 64 + "]" * 64, "x")
 
 
-@contextmanager
-def only_scan_error():
-    """Lets a ScanError of one line pass; anything else fails the test."""
-    caught = None
-    try:
-        yield
-    except ScanError as e:
-        caught = str(e)
-    assert caught is None or "\n" not in caught
+def test_truth_archives_are_held_against_their_claims(tmp_path):
+    """A bomb, a header of more numbers than there are, objects: refused before anything is unpacked or run."""
+    path = tmp_path / "t.npz"
+    np.savez_compressed(path, a=np.zeros(20_000_000))
+    with pytest.raises(ScanError, match="damaged"):
+        read_npz(path, "truth", ["a"])
+    np.savez(path, a=np.array([{}], object))
+    with pytest.raises(ScanError, match="damaged"):
+        read_npz(path, "truth", ["a"])
+    np.savez(path, a=np.arange(6.0).reshape(2, 3).T, b=np.array(["x"]))
+    assert np.array_equal(read_npz(path, "truth", ["a"])[0], np.arange(6.0).reshape(2, 3).T)
+    with pytest.raises(ScanError, match="no array of numbers"):
+        read_npz(path, "truth", ["b"])
 
 
-def damage(data, edits, cut):
-    """Bytes replaced at relative places, then cut off."""
-    out = bytearray(data)
-    for where, value in edits:
-        out[int(where * (len(out) - 1))] = value
-    return bytes(out[: int(cut * len(out))] if cut < 1 else out)
-
-
-EDITS = st.lists(st.tuples(st.floats(0, 1), st.integers(0, 255)), min_size=0, max_size=4)
-CUT = st.one_of(st.just(1.0), st.floats(0, 1))
-
-
-@FUZZ
-@given(name=st.sampled_from(["scan.json", "frames.csv", "trajectory.txt", DEPTH, THERMAL]), edits=EDITS, cut=CUT)
-def test_damaged_native_files(good, tmp_path_factory, name, edits, cut):
-    root = tmp_path_factory.mktemp("fuzz") / "scan"
-    shutil.copytree(good, root)
-    (root / name).write_bytes(damage((good / name).read_bytes(), edits, cut))
-    with only_scan_error():
-        verify(open_scan(root))
-    shutil.rmtree(root.parent)
-
-
-CONTAINERS = {
-    "raw": make.flir_jpeg(make.flir_block(np.full((12, 16), 15000, np.uint16))),
-    "png": make.flir_jpeg(make.flir_block(np.full((12, 16), 15000, np.uint16), png=True)),
-    "seq": 2 * make.flir_block(np.full((12, 16), 15000, np.uint16), order=">"),
-}
-
-
-@FUZZ
-@given(kind=st.sampled_from(sorted(CONTAINERS)), edits=EDITS, cut=CUT)
-def test_damaged_flir(kind, edits, cut):
-    with only_scan_error():
-        for frame in flir.parse(damage(CONTAINERS[kind], edits, cut), "x"):
-            assert frame.parameters.temperature_degC(frame.raw).shape == frame.raw.shape
-
-
-@pytest.fixture(scope="session")
-def small_mkv():
-    depth = np.full((2, 288, 320), 1000, np.uint16)
-    jpeg = [cv2.imencode(".jpg", np.zeros((720, 1280, 3), np.uint8))[1].tobytes()] * 2
-    parameters = (0.5, 0.5, 0.5, 0.6, *[0.0] * 10)
-    return make.azure_mkv(depth, jpeg, [0, 33], make.calibration_json(parameters, parameters))
-
-
-@FUZZ
-@given(edits=st.lists(st.tuples(st.floats(0, 0.012), st.integers(0, 255)), max_size=4), cut=CUT)
-def test_damaged_mkv(small_mkv, tmp_path_factory, edits, cut):
-    """Most edits fall on the structure: the first hundredth of the file."""
-    file = tmp_path_factory.mktemp("fuzz") / "take.mkv"
-    file.write_bytes(damage(small_mkv, edits, cut))
-    with only_scan_error():
-        verify(open_scan(file, format="azure-mkv"))
-    file.unlink()
-
-
-HEADS = [b"P5 4 4 255\n", b"P6 ", b"II*\0", b"MM\0*", b"\xff\xd8\xff"]
-
-
-@FUZZ
-@given(data=st.binary(max_size=200), head=st.sampled_from(HEADS))
-def test_damaged_image_headers(data, head):
-    with only_scan_error():
-        decode_image(head + data, shape=None, kind="depth", place="x")
-    with only_scan_error():
-        read_pnm(head + data, place="x")
+def test_what_a_user_names_cannot_steer_a_terminal(tmp_path, capsys):
+    hostile = "a\x1b[31m\x9b2J\u202e\n\udcff\ud800\U000e0001"
+    assert visible(hostile) == r"a\u001b[31m\u009b2J\u202e\u000a\udcff\ud800\udb40\udc01"
+    assert visible("Müller \u00a0体") == "Müller \u00a0体"
+    assert str(ScanError(hostile, place=hostile, hint=hostile)).isprintable()
+    assert len(str(ScanError("x" * 10_000))) < 700
+    emit({"name": hostile}, "", True)
+    assert json.loads(capsys.readouterr().out) == {"name": hostile}
+    note(hostile)
+    assert capsys.readouterr().err == visible(hostile) + "\n"
+    with pytest.raises(ScanError, match=r"nothing\\u001b"):
+        open_scan(tmp_path / "nothing\x1b[2J")

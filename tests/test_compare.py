@@ -208,14 +208,14 @@ def test_contact_readings(tmp_path):
 @pytest.mark.parametrize(
     ("name", "text", "match"),
     [
-        ("a.csv", "x_m,y_m,z_m,degC\n0,0,0,33\n", "column uncertainty_K is missing"),
+        ("a.csv", "x_m,y_m,z_m,degC\n0,0,0,33\n", r"column\(s\) uncertainty_K are missing"),
         ("a.csv", "x_m,y_m,z_m,degC,uncertainty_K\n", "no contact reading"),
         ("a.csv", "x_m,y_m,z_m,degC,uncertainty_K\n0,0,zero,33,0.1\n", "reading 1"),
         ("a.csv", "x_m,y_m,z_m,degC,uncertainty_K\n0,0,0,33,-1\n", "uncertainty_K"),
-        ("a.json", "{", "not a JSON file"),
+        ("a.json", "{", "not valid JSON"),
         ("a.json", "{}", "must be a list"),
         ("a.json", '[{"p_world_m": [0, 0], "degC": 33, "uncertainty_K": 0.1}]', "reading 1"),
-        ("a.json", '[{"p_world_m": [0, 0, 0], "degC": NaN, "uncertainty_K": 0.1}]', "degC"),
+        ("a.json", '[{"p_world_m": [0, 0, 0], "degC": NaN, "uncertainty_K": 0.1}]', "NaN"),
     ],
 )
 def test_readings_that_cannot_be_used(tmp_path, name, text, match):
@@ -236,7 +236,7 @@ def test_refusals(tmp_path):
     with pytest.raises(ScanError, match="nothing here"):
         load_temperatures(tmp_path / "absent")
     np.savez(tmp_path / "bad.npz", vertices_m=np.zeros((3, 3)))
-    with pytest.raises(ScanError, match="truth cannot be read"):
+    with pytest.raises(ScanError, match="the truth has no array 'triangles'"):
         load_temperatures(tmp_path / "bad.npz")
     unmeasured = result()
     write_ply(tmp_path / "egg.ply", unmeasured)

@@ -412,7 +412,7 @@ def test_flir_equals_the_independent_decoding(shared_data, name):
 
 
 def test_flir_alone_is_no_scan_but_joins_one(tmp_path):
-    raw = np.full((40, 56), 14000, np.uint16)
+    raw = (14000 + np.arange(40 * 56) % 7).astype(np.uint16).reshape(40, 56)
     blocks = b"".join(make.flir_block(raw + i, time_s=1_300_000_000 + i) for i in range(2))
     file = tmp_path / "walk.seq"
     file.write_bytes(blocks)

@@ -6,10 +6,33 @@ catches `ThermofusionError` in one place, prints it, and exits with the class's 
 
 from __future__ import annotations
 
+import re
+import unicodedata
 from typing import ClassVar
 
 INTERRUPTED = 130  # exit code after Ctrl-C, as shells count it
 INTERRUPTED_SENTENCE = "interrupted; what was computed is kept and the next run continues from there"
+LONGEST_CLAUSE = 600  # characters: ours are shorter, what they quote of a file need not be
+
+
+def visible(text: str) -> str:
+    """A user's text (a name, a path, a key of a file) as it may stand in a line: what is not seen stands as `\\u001b`.
+
+    That is what steers a terminal, turns its writing direction, ends a line, or is half a character; blanks of all
+    widths stay. The escapes are JSON's, so that a JSON text stays one.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or unicodedata.category(c) == "Zs" else _escaped(c) for c in text)
+
+
+def _escaped(character: str) -> str:
+    return re.sub("....", r"\\u\g<0>", character.encode("utf-16-be", "surrogatepass").hex())
+
+
+def _clause(text: str) -> str:
+    shown = visible(text.rstrip("."))
+    return shown if len(shown) <= LONGEST_CLAUSE else f"{shown[:LONGEST_CLAUSE]}..."
 
 
 class ThermofusionError(Exception):
@@ -25,9 +48,9 @@ class ThermofusionError(Exception):
     exit_code: ClassVar[int] = 1
 
     def __init__(self, cause: str, *, place: object = None, hint: str | None = None) -> None:
-        self.cause = cause.rstrip(".")
-        self.place = None if place is None else str(place)
-        self.hint = None if hint is None else hint.rstrip(".")
+        self.cause = _clause(cause)
+        self.place = None if place is None else visible(str(place))
+        self.hint = None if hint is None else _clause(hint)
         super().__init__(self.sentence())
 
     def sentence(self) -> str:

@@ -294,7 +294,7 @@ def load_recipe(
         place = str(path)
         try:
             tree = tomllib.loads(path.read_text(encoding="utf-8"))
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
+        except (ValueError, RecursionError) as e:  # a number of too many digits is a ValueError, too
             raise RecipeError(f"not a TOML file: {e}", place=place) from None
     tree = _under_new_names(tree, note)
     given = [_override(tree, item, note) for item in overrides]

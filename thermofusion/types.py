@@ -32,7 +32,7 @@ def check_rigid(T: object, name: str) -> Float:
     if not np.isfinite(M).all():
         raise ValueError(f"{name} has entries that are not finite numbers")
     R = M[:3, :3]
-    if np.abs(R.T @ R - np.eye(3)).max() > RIGID_TOLERANCE or np.linalg.det(R) < 0:
+    if np.abs(R).max() > 2 or np.abs(R.T @ R - np.eye(3)).max() > RIGID_TOLERANCE or np.linalg.det(R) < 0:
         raise ValueError(f"{name} is no rigid transform: its 3x3 part is not a rotation")
     if np.abs(M[3] - [0, 0, 0, 1]).max() > 1e-9:
         raise ValueError(f"{name} must have the last row 0 0 0 1")
@@ -378,7 +378,11 @@ class ThermalMesh:
         object.__setattr__(self, "uncertainty_parts", parts)
 
     def _column(self, values: object, name: str, dtype: DTypeLike) -> NDArray:
-        column = np.ascontiguousarray(values, dtype=dtype)
+        try:
+            with np.errstate(invalid="raise", over="raise"):
+                column = np.ascontiguousarray(values, dtype=dtype)
+        except FloatingPointError:
+            raise ValueError(f"{name} has a value that does not fit {np.dtype(dtype).name}") from None
         if column.shape != (len(self.surface),):
             raise ValueError(f"{name} has shape {column.shape}, the surface has {len(self.surface)} vertices")
         if np.isinf(column).any():

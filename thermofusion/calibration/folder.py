@@ -19,7 +19,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, date, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
@@ -27,8 +27,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from ..errors import ScanError
-from ..files.reading import depth_from_raw, inside, read_image, read_json
+from ..files.reading import MAX_NAME, depth_from_raw, inside, is_named, read_image, read_json
 from ..files.strict import ClosedBorder, validated
+from ..scans.native.schema import CameraDoc, camera_of, matrix_of
 from ..types import Camera, Float, check_rigid
 from .board.board import Board
 from .detect.depth_samples import NO_DISPARITY
@@ -40,41 +41,36 @@ PICTURE_SUFFIXES = ("png", "jpg", "tiff", "tif", "pgm", "raw")
 
 class _BoardDoc(ClosedBorder):
     kind: str = "checkerboard"
-    columns: int
-    rows: int
-    spacing_m: float
-    mark_ratio: float = 0.5
-
-
-class _Lens(ClosedBorder):
-    width_px: int
-    height_px: int
-    K: list[list[float]]
-    distortion: list[float] = Field(default_factory=list)
+    columns: int = Field(ge=2, le=1000)
+    rows: int = Field(ge=2, le=1000)
+    spacing_m: float = Field(ge=0.0001, le=10)
+    mark_ratio: float = Field(0.5, ge=0.05, le=0.95)
 
 
 class _DepthDoc(ClosedBorder):
-    unit_m: float = Field(0.001, gt=0)
-    invalid: list[int] = Field(default_factory=lambda: [0])
+    unit_m: float = Field(0.001, gt=1e-6, le=0.1)
+    invalid: list[Annotated[int, Field(ge=0, le=65535)]] = Field(default_factory=lambda: [0], max_length=1000)
     kind: Literal["metric", "disparity"] = "metric"
-    camera: _Lens | None = None
+    camera: CameraDoc | None = None
     lens_known: bool = False
     T_depth_color: list[list[float]] | None = None
 
 
 class _RawDoc(ClosedBorder):
-    width_px: int = Field(gt=0)
-    height_px: int = Field(gt=0)
+    width_px: int = Field(gt=0, le=32767)
+    height_px: int = Field(gt=0, le=32767)
     big_endian: bool = False
-    header_bytes: int = Field(0, ge=0)
+    header_bytes: int = Field(0, ge=0, le=1_000_000)
 
 
 class _Config(ClosedBorder):
     board: _BoardDoc
-    files: dict[Literal["color", "thermal", "depth", "infrared"], str] = Field(default_factory=dict)
+    files: dict[Literal["color", "thermal", "depth", "infrared"], Annotated[str, Field(max_length=MAX_NAME)]] = Field(
+        default_factory=dict
+    )
     depth: _DepthDoc = _DepthDoc()
     thermal_raw: _RawDoc | None = None
-    picks: str | None = None
+    picks: str | None = Field(None, max_length=MAX_NAME)
     free_spacing: bool = False
     mirrored: list[Literal["color", "thermal", "depth"]] = Field(default_factory=list)
 
@@ -168,12 +164,13 @@ def open_folder(
         raise ScanError(
             "no pictures are here", place=root, hint=f"put them in color/, thermal/, depth/ or name `files` in {FILE}"
         )
-    lens = c.depth.camera
-    try:
-        camera = lens and Camera(lens.width_px, lens.height_px, np.array(lens.K), np.array(lens.distortion))
-        T = None if c.depth.T_depth_color is None else check_rigid(c.depth.T_depth_color, "T_depth_color")
-    except ValueError as e:
-        raise ScanError(f"key 'depth': {e}", place=root / FILE) from None
+    T = None
+    if c.depth.T_depth_color is not None:
+        try:
+            T = check_rigid(matrix_of(c.depth.T_depth_color, "depth.T_depth_color", root / FILE), "T_depth_color")
+        except ValueError as e:
+            raise ScanError(f"key 'depth': {e}", place=root / FILE) from None
+    camera = None if c.depth.camera is None else camera_of(c.depth.camera, "depth.camera", root / FILE)
     return CalibrationFolder(
         root=root,
         board=board or Board(**c.board.model_dump()),
@@ -182,7 +179,7 @@ def open_folder(
         free_spacing=c.free_spacing,
         mirrored=frozenset(c.mirrored),
         depth_kind=c.depth.kind,
-        depth_camera=camera or None,
+        depth_camera=camera,
         depth_lens_known=c.depth.lens_known and camera is not None,
         T_depth_color=T,
         _config=c,
@@ -194,10 +191,10 @@ def _load(root: Path, config: Mapping[str, Any] | None, board: Board | None) -> 
     tree: dict[str, Any]
     if config is not None:
         tree = dict(config)
-    elif path.is_file():
-        tree = read_json(path)
     else:
-        tree = {}
+        tree = read_json(path) if is_named(path) else {}
+    if not isinstance(tree, dict):
+        raise ScanError("expected a table of keys", place=path)
     if board is not None:
         tree["board"] = {"kind": board.kind, "columns": board.columns, "rows": board.rows, "spacing_m": board.spacing_m}
     if "board" not in tree:

@@ -14,6 +14,7 @@ from ..errors import ScanError
 from ..files.reading import read_json
 from ..files.strict import validated
 from ..files.whole import write_text
+from ..scans.common import make_rig
 from ..scans.native.schema import STREAMS, RigDoc, RigExtrinsicsDoc, camera_of, matrix_of
 from ..types import Camera, Float, Rig, SignalCurve
 from .fit.cameras import INTRINSIC_NAMES
@@ -39,8 +40,10 @@ class RigFile:
         """As the method takes it. Raises ScanError if the calibration had no depth camera."""
         if "depth" not in self.cameras:
             raise ScanError("the rig was calibrated without a depth camera", hint="calibrate with depth images")
-        color = self.cameras.get("color") if "T_color_depth" in self.extrinsics else None
-        return Rig(self.cameras["depth"], color, self.extrinsics.get("T_color_depth"))
+        color, T_color_depth = self.cameras.get("color"), self.extrinsics.get("T_color_depth")
+        if color is None or T_color_depth is None:
+            return Rig(self.cameras["depth"])
+        return make_rig(self.cameras["depth"], color, T_color_depth, place="extrinsics.T_color_depth")
 
 
 def rig_document(
@@ -112,7 +115,7 @@ def write_rig(path: Path, document: dict[str, Any]) -> None:
 
 def read_rig(path: Path) -> RigFile:
     """Read rig.json. Raises ScanError naming the key."""
-    tree = read_json(path)
+    tree = read_json(path, "rig")
     if not isinstance(tree, dict) or tree.get("schema") != SCHEMA:
         raise ScanError(
             f"key 'schema': expected '{SCHEMA}'", place=path, hint="write one with `thermofusion calibrate`"
@@ -124,7 +127,14 @@ def read_rig(path: Path) -> RigFile:
     cameras = {n: camera_of(c, f"cameras.{n}", path) for n, c in groups.items() if c is not None}
     rows = {k: getattr(doc.extrinsics, k) for k in RigExtrinsicsDoc.model_fields}
     extrinsics = {k: matrix_of(r, f"extrinsics.{k}", path) for k, r in rows.items() if r is not None}
-    return RigFile(cameras, extrinsics, {k: np.array(v) for k, v in doc.covariances.items()}, tree)
+    covariances = {name: _square(r, f"covariances.{name}", path) for name, r in doc.covariances.items()}
+    return RigFile(cameras, extrinsics, covariances, tree)
+
+
+def _square(rows: list[list[float]], key: str, path: Path) -> Float:
+    if not 0 < len(rows) <= 12 or any(len(r) != len(rows) for r in rows):
+        raise ScanError(f"key '{key}': expected a square matrix", place=path)
+    return np.array(rows, np.float64)
 
 
 def _camera_doc(c: Camera) -> dict[str, Any]:

@@ -9,9 +9,9 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, TextIO
 
-from ..errors import RecipeError
+from ..errors import RecipeError, visible
 from ..files.json import to_json
 from ..progress import Progress
 
@@ -35,19 +35,32 @@ def leave(code: int) -> NoReturn:
 def fail(sentence: str, code: int, as_json: bool) -> NoReturn:
     """Print one sentence (or one JSON object) and exit with the code."""
     if as_json:
-        print(to_json({"error": sentence, "exit_code": code}))
-    print(f"error: {sentence}", file=sys.stderr)
+        say(to_json({"error": sentence, "exit_code": code}))
+    note(f"error: {sentence}")
     leave(code)
+
+
+def say(text: str, stream: TextIO | None = None) -> None:
+    """Lines on stdout, or another stream: the one place that writes to a terminal.
+
+    What could steer it, and what its encoding lacks, stands as an escape.
+    """
+    stream = sys.stdout if stream is None else stream
+    if stream is not None:  # closed by whoever started us
+        encoding = stream.encoding or "utf-8"
+        shown = "\n".join(visible(line) for line in text.split("\n"))
+        print(shown.encode(encoding, "backslashreplace").decode(encoding), file=stream)
 
 
 def emit(value: object, text: str, as_json: bool) -> None:
     """The result: JSON for programs, text for people."""
-    print(to_json(value) if as_json else text)
+    say(to_json(value) if as_json else text)
 
 
 def note(text: str) -> None:
     """A line for people, beside the result."""
-    print(text, file=sys.stderr)
+    if sys.stderr is not None:
+        say(visible(text), sys.stderr)
 
 
 def named(out: Path) -> Path:
@@ -75,7 +88,7 @@ def progress(quiet: bool = False) -> Iterator[Progress]:
     """A callback (stage, done, total): a live bar on a terminal, one plain line per stage elsewhere."""
     if quiet:
         yield lambda stage, done, total: None
-    elif sys.stderr.isatty():
+    elif sys.stderr is not None and sys.stderr.isatty():
         with _bars() as bars:
             yield bars
     else:
@@ -88,13 +101,18 @@ def _bars() -> Iterator[Progress]:
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Live
 
-    columns = (TextColumn("{task.description:<12}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    columns = (
+        TextColumn("{task.description:<12}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
     with Live(*columns, console=Console(stderr=True)) as live:
         tasks: dict[str, int] = {}
 
         def step(stage: str, done: int, total: int) -> None:
             if stage not in tasks:
-                tasks[stage] = live.add_task(stage, total=total)
+                tasks[stage] = live.add_task(visible(stage), total=total)
             live.update(tasks[stage], completed=done, total=total)  # type: ignore[arg-type]
 
         yield step
@@ -109,5 +127,5 @@ class _Lines:
     def __call__(self, stage: str, done: int, total: int) -> None:
         start = self._start.setdefault(stage, time.monotonic())
         if done >= total and start >= 0:
-            print(f"{stage}: {total} done in {time.monotonic() - start:.1f} s", file=sys.stderr)
+            note(f"{stage}: {total} done in {time.monotonic() - start:.1f} s")
             self._start[stage] = -1.0

@@ -210,7 +210,7 @@ def read_glb(path: str | Path) -> ThermalMesh:
         for name, values in found.items():
             columns[name] = np.full(count, 0 if name in ("observations", "flags") else np.nan, np.float32)
             columns[name][: len(values)] = values
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError):
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError, RecursionError):
         raise ScanError("the GLB is none that thermofusion wrote, or is damaged", place=path) from None
     return result_from(surface_from(positions, triangles, normals, None, path), columns, {}, description, path)
 

@@ -117,12 +117,16 @@ class _Header:
     description: dict[str, Any] = field(default_factory=dict)
 
 
+def _is_count(word: str) -> bool:
+    return word.isascii() and word.isdecimal() and len(word) < 20
+
+
 def _parse(data: bytes, place: str | Path) -> _Header:
     """The header. Raises ScanError for what `read_ply` cannot read."""
     if not data.startswith((b"ply\n", b"ply\r\n")):
         raise ScanError("the file is no PLY", place=place)
-    end = data.find(b"end_header")
-    size = data.find(b"\n", end) + 1
+    end = data.find(b"\nend_header")  # at the start of a line: a name in a comment may say it, too
+    size = data.find(b"\n", end + 1) + 1
     if end < 0 or size == 0:
         raise ScanError("the PLY header has no end", place=place)
     header, comments = _Header(size), dict[str, str]()
@@ -133,9 +137,9 @@ def _parse(data: bytes, place: str | Path) -> _Header:
                 formats.append(" ".join(rest))
             case ["comment", "thermofusion", key, *_]:
                 comments[key] = comments.get(key, "") + line.split(" ", 3)[-1]
-            case ["element", "vertex", count] if count.isdecimal() and not element:
+            case ["element", "vertex", count] if _is_count(count) and not element:
                 element, header.vertices = "vertex", int(count)
-            case ["element", "face", count] if count.isdecimal() and element == "vertex":
+            case ["element", "face", count] if _is_count(count) and element == "vertex":
                 element, header.faces = "face", int(count)
             case ["property", kind, name] if element == "vertex" and kind in _NUMBERS:
                 header.vertex.append((name, "<" + _NUMBERS[kind]))
@@ -153,6 +157,6 @@ def _parse(data: bytes, place: str | Path) -> _Header:
         raise ScanError("the PLY's faces are no list of vertex indices", place=place)
     try:
         header.description = {key: json.loads(text) for key, text in comments.items()}
-    except (json.JSONDecodeError, RecursionError):
+    except (ValueError, RecursionError):
         raise ScanError("the PLY's thermofusion comments are damaged", place=place) from None
     return header

@@ -95,7 +95,7 @@ def read_vtp(path: str | Path) -> ThermalMesh:
         polys = _arrays(piece, "Polys", data, start, counts["Polys"], path)
         columns = _arrays(piece, "PointData", data, start, counts["Points"], path)
         description = _description(root)
-    except (ET.ParseError, ValueError, KeyError) as e:
+    except (ET.ParseError, ValueError, KeyError, RecursionError) as e:
         raise ScanError(f"the VTP is damaged ({e})", place=path) from None
     triangles = polys.get("connectivity", np.zeros(0, np.int32))
     if counts["Strips"] or counts["Lines"] or len(triangles) != 3 * counts["Polys"]:

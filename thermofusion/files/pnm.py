@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from ..errors import ScanError
 
-_HEADER = re.compile(rb"P([56])(?:\s+|#[^\n]*\n)+(\d{1,7})(?:\s+|#[^\n]*\n)+(\d{1,7})(?:\s+|#[^\n]*\n)+(\d{1,5})\s")
+_GAP = rb"(?:\s|#[^\n]*\n)++"  # possessive: what was read is never tried another way, so no header takes long
+_HEADER = re.compile(rb"P([56])" + (_GAP + rb"(\d{1,7}+)") * 2 + _GAP + rb"(\d{1,5}+)\s")
 
 
 def read_pnm(data: bytes, *, place: object, byteorder: Literal[">", "<"] = ">", header_only: bool = False) -> NDArray:

@@ -1,12 +1,18 @@
-"""Files at the border: safe paths, whole reads, images decoded and checked, with the file named in every error."""
+"""Files at the border: safe paths, one door for every file, JSON, numbers, images; the file named in every error."""
 
 from __future__ import annotations
 
+import io
 import json
+import math
+import os
+import stat
 import struct
 import zlib
+from array import array
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, NoReturn
 
 import cv2
 import numpy as np
@@ -17,10 +23,17 @@ from ..types import Float
 from .pnm import read_pnm
 
 MAX_PIXELS = 64_000_000  # a header that claims more is refused before it is decoded
-MAX_FILE_BYTES = 512 * 2**20  # of one image or text file
+MAX_FILE_BYTES = 512 * 2**20  # of one image or mesh
+MAX_TEXT_BYTES = 128 * 2**20  # of a text file: a million poses with room to spare
+MAX_JSON_BYTES = 16 * 2**20  # Python's objects take some twenty times as much
+MAX_JSON_DEPTH = 64  # ours have seven
+MAX_LINES = 1_500_000  # of a text file: a million frames, nine hours at 30 a second, and their heads
+MAX_LINE = 100_000  # characters of a line in a text table
 MAX_NAME = 1000  # characters of a path inside a scan
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 COPY_AGAIN = "copy the recording again"
+# A pipe without a writer would block whoever opens it. Windows tells binary from text.
+_OPEN_FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 
 
 def inside(root: Path, name: str, *, place: object) -> Path:
@@ -37,62 +50,191 @@ def inside(root: Path, name: str, *, place: object) -> Path:
     return path
 
 
-def read_bytes(path: Path, kind: str = "image") -> bytes:
-    """A whole regular file. Raises ScanError: absent, no regular file (a pipe would block for ever), empty, huge."""
+def is_named(path: Path) -> bool:
+    """Whether something has this name, be it a pipe or a link to nothing: a file that may be absent, but not so."""
+    return os.path.lexists(path)
+
+
+def open_regular(path: str | Path, kind: str = "", *, limit_bytes: int | None = MAX_FILE_BYTES) -> BinaryIO:
+    """A regular file, open for reading: the one door for all files from outside.
+
+    kind : what the file is, for messages. limit_bytes : None = any size (for what is mapped, not read). Raises
+    ScanError: absent, a link to nothing, a folder, pipe or device (none of which is ever waited for), huge.
+    """
+    path, what = Path(path), f"the {kind} file" if kind else "the file"
     try:
-        if not path.exists():
-            raise ScanError(f"the {kind} file is named in the scan but absent", place=path, hint=COPY_AGAIN)
-        if not path.is_file():
-            raise ScanError(f"the {kind} file is a folder or a device, expected a regular file", place=path)
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise ScanError(f"the {kind} file is larger than {MAX_FILE_BYTES >> 20} MiB", place=path)
-        data = path.read_bytes()
+        _check_regular(path.stat(), what, path)
+        file = os.fdopen(os.open(path, _OPEN_FLAGS), "rb")
+    except FileNotFoundError:
+        state = "a link to nothing" if path.is_symlink() else "absent"
+        raise ScanError(f"{what} is {state}", place=path, hint=COPY_AGAIN) from None
     except OSError as e:
-        raise ScanError(f"the {kind} file cannot be read ({e.strerror})", place=path) from None
+        raise ScanError(f"{what} cannot be read ({e.strerror})", place=path) from None
+    except ValueError:  # a name with NUL or half a character
+        raise ScanError(f"{what} has a name that no file can have", place=path) from None
+    try:
+        status = os.fstat(file.fileno())
+        _check_regular(status, what, path)  # again: it may have been exchanged since
+        if limit_bytes is not None and status.st_size > limit_bytes:
+            raise ScanError(f"{what} is larger than {limit_bytes >> 20} MiB", place=path)
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+def _check_regular(status: os.stat_result, what: str, path: object) -> None:
+    if not stat.S_ISREG(status.st_mode):
+        raise ScanError(f"{what} is a folder, a pipe or a device, expected a regular file", place=path)
+
+
+def read_head(path: Path, count: int) -> bytes:
+    """The first `count` bytes, to recognise a file by; none of what is no regular file."""
+    try:
+        with open_regular(path, limit_bytes=None) as f:
+            return f.read(count)
+    except (ScanError, OSError):
+        return b""
+
+
+def read_bytes(path: str | Path, kind: str = "image", *, limit_bytes: int = MAX_FILE_BYTES) -> bytes:
+    """A whole regular file. Raises ScanError, as `open_regular` does, and for an empty one."""
+    with open_regular(path, kind, limit_bytes=limit_bytes) as f:
+        try:
+            data = f.read(limit_bytes + 1)
+        except OSError as e:
+            raise ScanError(f"the {kind} file cannot be read ({e.strerror})", place=path) from None
     if not data:
         raise ScanError(f"the {kind} file is empty", place=path, hint=COPY_AGAIN)
     return data
 
 
-def read_text(path: Path, kind: str = "text") -> str:
+def read_text(path: Path, kind: str = "text", *, limit_bytes: int = MAX_TEXT_BYTES) -> str:
     """A whole text file in UTF-8 (a byte-order mark is fine)."""
     try:
-        return read_bytes(path, kind).decode("utf-8-sig")
+        return read_bytes(path, kind, limit_bytes=limit_bytes).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise ScanError(f"the {kind} file is no UTF-8 text", place=path) from None
 
 
-def read_json(path: Path) -> Any:
+def text_lines(path: Path, kind: str = "text") -> Iterator[str]:
+    """The lines of a text file in UTF-8, with their ends, one after another: little memory whatever its size.
+
+    Raises ScanError: as `read_text`; for a line of more than `MAX_LINE` characters, for more than `MAX_LINES` lines.
+    """
+    with open_regular(path, kind, limit_bytes=MAX_TEXT_BYTES) as binary:
+        try:
+            number = 0
+            with io.TextIOWrapper(binary, "utf-8-sig", newline="") as f:
+                while line := f.readline(MAX_LINE + 1):
+                    number += 1
+                    if len(line) > MAX_LINE:
+                        text = f"the line has more than {MAX_LINE:,} characters"
+                        raise ScanError(text, place=f"{path}, line {number}")
+                    if number > MAX_LINES:
+                        raise ScanError(f"the {kind} file has more than {MAX_LINES:,} lines", place=path)
+                    yield line
+        except UnicodeDecodeError:
+            raise ScanError(f"the {kind} file is no UTF-8 text", place=path) from None
+        except OSError as e:
+            raise ScanError(f"the {kind} file cannot be read ({e.strerror})", place=path) from None
+    if number == 0:
+        raise ScanError(f"the {kind} file is empty", place=path, hint=COPY_AGAIN)
+
+
+def read_json(path: Path, kind: str = "JSON") -> Any:
     """A JSON file; ScanError with the line for a fault in it."""
-    return parse_json(read_text(path, "JSON"), path)
+    return parse_json(read_text(path, kind, limit_bytes=MAX_JSON_BYTES), path)
 
 
 def parse_json(text: str, place: object) -> Any:
-    """JSON text; ScanError with the line for a fault in it."""
+    """JSON text; ScanError with the line or the key for a fault in it.
+
+    A key that stands twice, NaN, infinite numbers and halves of characters are faults, as is deep nesting.
+    """
     try:
-        return json.loads(text)
+        tree = json.loads(text, object_pairs_hook=_once, parse_constant=_not_finite, parse_float=_finite)
+        _check_tree(tree)
     except json.JSONDecodeError as e:
         raise ScanError(f"not valid JSON: {e.msg} at line {e.lineno}", place=place) from None
-    except (ValueError, RecursionError):
-        raise ScanError("not valid JSON: a number too long, or nested too deep", place=place) from None
+    except RecursionError:
+        raise ScanError("not valid JSON: it is nested too deep", place=place) from None
+    except _JsonError as e:
+        raise ScanError(f"not valid JSON: {e}", place=place) from None
+    except ValueError:
+        raise ScanError("not valid JSON: a number has too many digits", place=place) from None
+    return tree
+
+
+class _JsonError(Exception):
+    """A fault that Python's reader lets pass."""
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    tree = dict(pairs)
+    if len(tree) < len(pairs):
+        names = [k for k, _ in pairs]
+        twice = next(k for k in names if names.count(k) > 1)
+        raise _JsonError(f"the key '{twice[:40]}' stands twice")
+    return tree
+
+
+def _not_finite(word: str) -> NoReturn:
+    raise _JsonError(f"{word} stands where a finite number is expected")
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if math.isinf(number):
+        _not_finite(text[:20])
+    return number
+
+
+def _check_tree(tree: Any) -> None:
+    """Level by level, without recursion."""
+    level = [tree]
+    for _ in range(MAX_JSON_DEPTH):
+        below: list[Any] = []
+        for node in level:
+            if isinstance(node, dict):
+                below.extend(node)
+                below.extend(node.values())
+            elif isinstance(node, list):
+                below.extend(node)
+            elif isinstance(node, str) and not _is_text(node):
+                raise _JsonError("a text holds half a character (a lone surrogate)")
+        if not below:
+            return
+        level = below
+    raise _JsonError("it is nested too deep")
+
+
+def _is_text(text: str) -> bool:
+    if text.isascii():
+        return True
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def read_numbers(path: Path, *, columns: int | None = None) -> Float:
     """Rows of numbers (N, columns), blanks or commas between, `#` comments; ScanError names the line."""
-    rows: list[list[float]] = []
-    for number, line in enumerate(read_text(path).splitlines(), 1):
+    numbers, rows, width = array("d"), 0, columns or 0
+    for number, line in enumerate(text_lines(path), 1):
         words = line.split("#")[0].replace(",", " ").split()
         if not words:
             continue
+        place = f"{path}, line {number}"
+        width, rows = width or len(words), rows + 1
         try:
-            row = [float(w) for w in words]
+            numbers.extend(map(float, words))
         except ValueError:
-            raise ScanError("expected numbers only", place=f"{path}, line {number}") from None
-        width = columns or (len(rows[0]) if rows else len(row))
-        if len(row) != width:
-            raise ScanError(f"expected {width} numbers, got {len(row)}", place=f"{path}, line {number}")
-        rows.append(row)
-    return np.array(rows, np.float64).reshape(len(rows), len(rows[0]) if rows else columns or 0)
+            raise ScanError("expected numbers only", place=place) from None
+        if len(words) != width:
+            raise ScanError(f"expected {width} numbers, got {len(words)}", place=place)
+    return np.frombuffer(numbers, np.float64).reshape(rows, width) if rows else np.zeros((0, width))
 
 
 def read_image(path: Path, *, shape: tuple[int, int] | None = None, kind: str = "image") -> NDArray:
@@ -212,11 +354,9 @@ def depth_from_raw(
 
 
 def read_whole(path: str | Path) -> bytes:
-    """A file's bytes. Raises ScanError."""
-    try:
-        return Path(path).read_bytes()
-    except OSError as e:
-        raise ScanError(f"the file cannot be read ({e.strerror})", place=path) from None
+    """A mesh's or an archive's bytes. Raises ScanError, as `open_regular` does."""
+    with open_regular(path) as f:
+        return f.read(MAX_FILE_BYTES + 1)
 
 
 def read_array(data: bytes, dtype: np.dtype | str, count: int, offset: int, place: object) -> NDArray:

@@ -9,7 +9,7 @@ from typing import Any, TypeVar, get_args
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic.fields import FieldInfo
 
-from ..errors import ScanError
+from ..errors import ScanError, visible
 
 Doc = TypeVar("Doc", bound=BaseModel)
 
@@ -46,15 +46,16 @@ def first_fault(model: type[BaseModel], error: ValidationError) -> tuple[tuple[s
     faults = error.errors(include_url=False)
     path, field = _field_at(model, faults[0]["loc"])
     fault = [f for f in faults if _field_at(model, f["loc"])[0] == path][-1]  # the last branch of a union says most
-    key = ".".join(path) or "(the whole document)"
+    key = shortened(".".join(path)) or "(the whole document)"
     if fault["type"] == "extra_forbidden":
         owner, _ = _field_at(model, fault["loc"][:-1])
-        return path, f"unknown key '{key}'{nearest(path[-1], _known_keys(model, owner))}"
+        return path, f"unknown key '{key}'{nearest(path[-1][:LONGEST], _known_keys(model, owner))}"
     got = "" if fault["type"] == "missing" else f", got {shortened(repr(fault['input']))}"
     low, high = _bounds(field)
     if fault["type"] in OFF_BOUNDS and (low is not None or high is not None):
         span = f"at least {low}" if high is None else f"at most {high}" if low is None else f"{low:g} to {high:g}"
-        unit = next((u for suffix, u in UNITS.items() if path[-1].endswith(suffix)), "")
+        name = next((part for part in reversed(path) if not part.isdigit()), "")  # not an item's number in a list
+        unit = next((u for suffix, u in UNITS.items() if f"_{name}".endswith(suffix)), "")
         return path, f"key '{key}': " + f"expected {span} {unit}".rstrip() + got
     message = fault["msg"].removeprefix("Value error, ")
     if fault["type"] == "model_type":
@@ -70,7 +71,7 @@ def nearest(word: str, known: Sequence[str]) -> str:
 
 def shortened(text: str) -> str:
     """A user's text as it may stand in a sentence: escapes visible, no longer than a line."""
-    shown = text if text.isprintable() else text.encode("unicode_escape", "backslashreplace").decode("ascii")
+    shown = visible(text)
     return shown if len(shown) <= LONGEST else f"{shown[: LONGEST - 3]}..."
 
 

@@ -15,16 +15,21 @@ from numpy.typing import NDArray
 
 from ..errors import RecipeError, ScanError
 from ..export import read_mesh
-from ..geometry.mesh import mesh_normals, vertex_areas
+from ..export.columns import result_from, surface_from
+from ..files.npz import read_npz
+from ..files.reading import is_named
+from ..files.tum import MAX_POSITION_M
+from ..geometry.mesh import vertex_areas
 from ..geometry.rays import RayScene
 from ..robust import NORMAL_95, weighted_quantile
-from ..types import Float, Float32, SurfaceMesh, ThermalMesh
+from ..types import Float, Float32, ThermalMesh
 from .contacts import SkinReading, read_contacts
 from .register import Registration, as_they_are, mirrored, register
 
 if TYPE_CHECKING:
     from ..report.plot import Axis, Mark
 
+TRUTH_ARRAYS = ("vertices_m", "triangles", "temperature_degC")
 MAX_DISTANCE_M = 0.010  # between partners on the two surfaces
 FACING = 0.5  # cosine between normals of partners
 CONTACT_RADIUS_M, CONTACT_FAR_M = 0.006, 0.03  # skin under a contact sensor; farther off is another place
@@ -168,23 +173,27 @@ def load_temperatures(path: Path | str) -> ThermalMesh:
     """A mesh with temperatures from a result, a mesh file, a truth archive, or a simulated scan's truth."""
     path = Path(path)
     truth = path / "truth" / "surface.npz"
-    if path.suffix.lower() == ".npz" or truth.is_file():
-        return _truth(path if path.suffix.lower() == ".npz" else truth)
-    if not path.exists():
+    if path.suffix.lower() == ".npz" or is_named(truth):
+        mesh = _truth(path if path.suffix.lower() == ".npz" else truth)
+    elif is_named(path):
+        mesh = read_mesh(path)
+    else:
         raise ScanError("there is nothing here", place=path, hint="name a result folder, a mesh, a truth or readings")
-    return read_mesh(path)
+    if not len(mesh.surface.triangles):
+        raise ScanError("the mesh has no triangles", place=path)
+    if np.abs(mesh.surface.vertices_m).max() > MAX_POSITION_M:
+        text = f"a vertex lies more than {MAX_POSITION_M:.0f} m from the origin, expected metres"
+        raise ScanError(text, place=path)
+    return mesh
 
 
 def _truth(path: Path) -> ThermalMesh:
-    try:
-        with np.load(path, allow_pickle=False) as z:
-            vertices, triangles = z["vertices_m"].astype(np.float32), z["triangles"].astype(np.int32)
-            temperature = z["temperature_degC"].astype(np.float32)
-        surface = SurfaceMesh(vertices, triangles, mesh_normals(vertices, triangles))
-        return ThermalMesh.from_temperature(surface, temperature)
-    except (OSError, ValueError, KeyError, IndexError) as e:
-        hint = "a truth holds vertices_m (V, 3), triangles (F, 3) and temperature_degC (V,)"
-        raise ScanError(f"the truth cannot be read ({e})", place=path, hint=hint) from None
+    hint = "a truth holds vertices_m (V, 3), triangles (F, 3) and temperature_degC (V,)"
+    vertices, triangles, temperature = read_npz(path, "truth", TRUTH_ARRAYS, hint=hint)
+    if triangles.dtype.kind not in "iu" or triangles.shape[1:] != (3,) or vertices.shape[1:] != (3,):
+        raise ScanError("the truth's arrays are of other kinds or shapes", place=path, hint=hint)
+    surface = surface_from(vertices, triangles, None, None, path)
+    return result_from(surface, {"temperature_degC": temperature}, {}, {}, path)
 
 
 def compare_meshes(

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ScanError
+from ..files.npz import read_npz
+from ..files.reading import read_numbers
 from ..geometry.rays import RayScene
 from ..geometry.rigid import rigid_alignment, transform_points
 from ..phantom import SceneConfig, load_scene, simulate
@@ -158,9 +160,8 @@ class Truth:
     @classmethod
     def read(cls, scan: Path) -> Truth:
         """From a scan folder."""
-        with np.load(scan / "truth" / "surface.npz") as z:
-            v, f, T = z["vertices_m"], z["triangles"], z["temperature_degC"]
-        path = np.loadtxt(scan / "truth" / "trajectory.txt", ndmin=2)
+        v, f, T = read_npz(scan / "truth" / "surface.npz", "truth", ["vertices_m", "triangles", "temperature_degC"])
+        path = read_numbers(scan / "truth" / "trajectory.txt", columns=8)
         return cls(RayScene(v, f), f, np.asarray(T, np.float64), path[:, 0], path[:, 1:4])
 
     def error(self, mesh: ThermalMesh, trajectory: Trajectory) -> TruthError:

@@ -256,7 +256,7 @@ def load_scene(source: str | Path) -> SceneConfig:
         path = shipped
     try:
         tree = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
+    except (ValueError, RecursionError) as e:  # a number of too many digits is a ValueError, too
         raise RecipeError(f"not a TOML file: {e}", place=path) from None
     return scene_from_mapping(tree, place=path)
 

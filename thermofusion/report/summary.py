@@ -191,9 +191,7 @@ def _quality(recipe: Recipe, scan: Scan, steps: Steps) -> dict[str, Any]:
     voxel_mm = 0.0 if steps.surface is None else 1e3 * steps.surface.voxel_m
     if voxel_mm > max(gate.max_voxel_mm, 0.0 if asked_mm == "auto" else 1.01 * asked_mm):
         bound = f"max_memory_gib = {recipe.surface.max_memory_gib:g}"
-        failed.append(
-            f"voxels grew to {voxel_mm:.0f} mm to keep {bound}, the recipe allows {gate.max_voxel_mm:g} mm"
-        )
+        failed.append(f"voxels grew to {voxel_mm:.0f} mm to keep {bound}, the recipe allows {gate.max_voxel_mm:g} mm")
     if tracked < gate.min_tracked_fraction:
         failed.append(f"{tracked:.0%} of the depth frames are tracked, the recipe asks {gate.min_tracked_fraction:.0%}")
     figures: dict[str, Any] = {"tracked_fraction": tracked}

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 
-from ..errors import RecipeError, ScanError
+from ..errors import RecipeError, ScanError, visible
+from ..files.reading import is_named
 from ..types import Scan
 from .native.compose import with_rig, with_thermal
 from .native.read import is_native, read_native
@@ -76,7 +77,10 @@ def open_scan(path: str | Path, *, format: str | None = None) -> Scan:
         there = False
     if not there:
         raise ScanError("there is no such scan", place=root)
-    known = find_format(format) if format else next((f for f in FORMATS if f.recognise(root)), None)
+    try:
+        known = find_format(format) if format else next((f for f in FORMATS if f.recognise(root)), None)
+    except OSError as e:
+        raise ScanError(f"it cannot be read ({e.strerror})", place=e.filename or root) from None
     if known is None:
         raise ScanError(
             "no known recording format was recognised here",
@@ -87,8 +91,9 @@ def open_scan(path: str | Path, *, format: str | None = None) -> Scan:
         scan = known.read(root)
     except OSError as e:
         raise ScanError(f"it cannot be read as {known.name} ({e.strerror})", place=e.filename or root) from None
+    scan = replace(scan, name=visible(scan.name))  # it goes into every file of a result and onto the terminal
     rig = (root if root.is_dir() else root.parent) / "rig.json"
-    return with_rig(scan, rig) if known.name != "native" and rig.is_file() else scan
+    return with_rig(scan, rig) if known.name != "native" and is_named(rig) else scan
 
 
 def find_format(name: str) -> Format:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,13 +18,15 @@ from ..geometry.camera import project
 from ..geometry.rigid import rotation_angle_deg, transform_points
 from ..physics.band import ZERO_DEGC_K
 from ..physics.signal import SignalConverter
-from ..types import Camera, Float, Scan, Stream, ThermalStream, UInt8
+from ..types import BlackbodyReference, Camera, Float, Scan, Stream, ThermalStream, UInt8
 from .overlay import OVERLAY_FRAMES, edge_overlays
 from .pairing import nearest_in_time
 
 DEPTH_RANGE_M = (0.15, 9.0)  # a room's median depth lies inside, whatever the camera; outside, the unit is wrong
+CONSTANT_FROM, CONSTANT_SHARE = 100, 0.99  # measured pixels, and the share of equal ones, that no camera makes
 BODY_RANGE_M = (0.3, 4.5)  # where a body scan's median depth is expected
 APPARENT_RANGE_DEGC = (-10.0, 80.0)  # the median of a frame with a body, or a phantom, in a room lies inside
+MAX_REFERENCE_ERROR_K = 30.0  # of a camera on a blackbody: its level drifts by a few K, its emissivity costs a few more
 MAX_BASELINE_M, MAX_ANGLE_DEG = 0.5, 45.0  # between cameras on one rig
 MAX_OVERLAY_SHIFT_PX = 4.0  # a picture that fits better elsewhere by more is worth a warning
 MIN_OVERLAY_CONTRAST = 1.25  # below, the best shift says nothing
@@ -108,7 +111,7 @@ def verify(scan: Scan, sample: int = 3) -> None:
 
 def _faults(scan: Scan, sample: int) -> Iterator[ScanError]:
     """All faults that make a scan unusable, most basic first."""
-    for step in (_time_faults, _depth_faults, _color_faults, _thermal_faults):
+    for step in (_time_faults, _depth_faults, _color_faults, _thermal_faults, _reference_faults):
         try:
             step(scan, sample)
         except ScanError as fault:
@@ -148,6 +151,14 @@ def _depth_faults(scan: Scan, sample: int) -> None:
             f"the depth mask is empty: none of {len(picks)} sampled frames has a single measurement",
             place=scan.depth.places[picks[0]],
         )
+    for i, frame in zip(picks, frames, strict=True):
+        if _is_constant(frame):
+            value = float(np.nanmedian(frame))
+            raise ScanError(
+                f"the depth image is constant: nearly every pixel says {value:.4g} m",
+                place=scan.depth.places[i],
+                hint="record with the sensor uncovered, and raw depth instead of a test picture",
+            )
     median = float(np.median(measured))
     if not DEPTH_RANGE_M[0] <= median <= DEPTH_RANGE_M[1]:
         raise ScanError(
@@ -164,6 +175,13 @@ def _depth_faults(scan: Scan, sample: int) -> None:
                 place=scan.root,
                 hint="check extrinsics.T_thermal_depth and cameras.thermal.K",
             )
+
+
+def _is_constant(image: NDArray) -> bool:
+    """Whether nearly all that an image (H, W) measures is one value, which no camera's noise allows."""
+    values = image[np.isfinite(image)]
+    same = np.count_nonzero(values == np.median(values)) if len(values) else 0
+    return bool(len(values) >= CONSTANT_FROM and same > CONSTANT_SHARE * len(values))
 
 
 def _share_seen(depth: NDArray, camera: Camera, other: Camera, T_other_depth: Float, step: int = 8) -> float:
@@ -193,8 +211,10 @@ def _thermal_faults(scan: Scan, sample: int) -> None:
     if not scan.thermal.usable.any():
         raise ScanError("every thermal frame is marked as taken during a shutter correction", place=scan.root)
     convert = SignalConverter(scan.thermal.camera)
-    for i in _sample(scan.thermal, sample):
+    picks, constant = _sample(scan.thermal, sample), 0
+    for i in picks:
         degC = _apparent_degC(scan.thermal, convert, i)
+        constant += _is_constant(degC)
         if not np.isfinite(degC).any():
             raise ScanError("the thermal frame has no measurement at all", place=scan.thermal.places[i])
         median = float(np.nanmedian(degC))
@@ -203,6 +223,39 @@ def _thermal_faults(scan: Scan, sample: int) -> None:
                 f"the thermal signal looks wrong: its median is {median:.0f} degC",
                 place=scan.thermal.places[i],
                 hint="check cameras.thermal.signal, and the byte order of the images",
+            )
+    if constant == len(picks):
+        raise ScanError(
+            f"the thermal image is constant: nearly every pixel says {median:.1f} degC",
+            place=scan.thermal.places[picks[0]],
+            hint="record with the shutter open and the lens uncovered",
+        )
+
+
+def _reference_faults(scan: Scan, sample: int) -> None:
+    """A blackbody that the camera sees far from its stated temperature would shift the whole result there."""
+    if scan.thermal is None:
+        return
+    convert = SignalConverter(scan.thermal.camera)
+    for number, reference in enumerate(r for r in scan.references if isinstance(r, BlackbodyReference)):
+        rows = np.flatnonzero(np.isin(scan.thermal.index, reference.frames) & scan.thermal.usable)
+        if len(rows) == 0:
+            raise ScanError(
+                f"the blackbody reference {number} names no thermal frame that is there and usable",
+                place=scan.root,
+                hint="its `frames` are the thermal stream's `index`",
+            )
+        i = int(rows[len(rows) // 2])
+        radiance = convert.radiance(scan.thermal.load(i), scan.thermal.places[i])
+        inside = np.zeros(radiance.shape, np.uint8)
+        cv2.fillPoly(inside, [np.rint(reference.polygon_px).astype(np.int32)], 1)
+        measured = radiance[(inside > 0) & np.isfinite(radiance)]
+        seen = float(np.median(convert.band.temperature_K(measured))) - ZERO_DEGC_K if len(measured) else np.nan
+        if not abs(seen - reference.degC) <= MAX_REFERENCE_ERROR_K:
+            raise ScanError(
+                f"the blackbody of {reference.degC:g} degC is seen at {seen:.0f} degC",
+                place=scan.thermal.places[i],
+                hint="check references: degC, thermal_polygon_px and frames",
             )
 
 

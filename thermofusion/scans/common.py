@@ -13,10 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ScanError
-from ..files.reading import claimed_size, decode_image, depth_from_raw, read_bytes
+from ..files.reading import MAX_PIXELS, claimed_size, decode_image, depth_from_raw, read_bytes
+from ..files.tum import MAX_TIME_S
 from ..types import Camera, Float, Rig, Stream, ThermalCamera, ThermalStream
 
 Kind = Literal["depth", "color", "thermal"]
+FOCAL_LENGTHS = (0.05, 100.0)  # in image sizes: from 170° across to half a degree
+MAX_CENTRE = 10.0  # of the principal point, in image sizes: cut-outs of a larger image have it far off
+MAX_DISTORTION = 1000.0  # of a term: rational models of wide lenses reach some tens
 ASSUMED_RATE_HZ = 30.0  # of recordings that carry no times
 # A Kinect v1 / PrimeSense camera whose calibration nobody recorded (Open3D's and OpenNI's default).
 NOMINAL_K = np.array([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]])
@@ -41,6 +45,9 @@ def make_stream(
     None = 0, 1, 2 ... usable : (N,) mask; None = all. Raises ScanError.
     """
     t = np.asarray(times_s, np.float64)
+    if len(t) and np.abs(t[np.isfinite(t)]).max(initial=0) > MAX_TIME_S:
+        text = f"the {kind} stream has a time beyond ±{MAX_TIME_S:g} s"
+        raise ScanError(text, place=place, hint="times are in seconds")
     numbers = np.arange(len(t)) if index is None else np.asarray(index, np.int64)
     if len(t) == 0:
         raise ScanError(f"there are no {kind} frames", place=place)
@@ -51,7 +58,7 @@ def make_stream(
         word = "repeat" if t[fault[0] + 1] == t[fault[0]] else "run backwards"
         raise ScanError(f"the times of the {kind} stream {word} at frame {numbers[fault[0] + 1]}", place=place)
     flags = np.ones(len(t), bool) if usable is None else np.asarray(usable, bool)
-    return Stream(t, load, tuple(str(p) for p in places), numbers, flags)
+    return Stream(t, load, tuple(map(str, places)), numbers, flags)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +70,7 @@ class ImageFiles:
     """
 
     kind: Kind
-    paths: Sequence[Path]
+    paths: Sequence[Path | str]
     times_s: Sequence[float] | NDArray
     place: object
     index: Sequence[int] | NDArray | None = None
@@ -149,9 +156,22 @@ def make_camera(
 ) -> Camera:
     """A `Camera` of K (3, 3) px and distortion (5,) or (8,), None = none; its faults as ScanError with the place."""
     try:
-        return Camera(width_px, height_px, K, np.zeros(5) if distortion is None else distortion)
-    except (ValueError, TypeError) as e:
+        camera = Camera(width_px, height_px, K, np.zeros(5) if distortion is None else distortion)
+    except (ValueError, TypeError, OverflowError) as e:
         raise ScanError(str(e), place=place) from None
+    if width_px * height_px > MAX_PIXELS:
+        raise ScanError(f"a camera of {width_px} x {height_px} px, at most {MAX_PIXELS} pixels are read", place=place)
+    size, K = max(width_px, height_px), camera.K
+    low, high = (round(f * size, 1) for f in FOCAL_LENGTHS)
+    if not (low <= K[0, 0] <= high and low <= K[1, 1] <= high):
+        text = f"K has focal lengths of {K[0, 0]:.4g} and {K[1, 1]:.4g} px, expected {low:g} to {high:g} px"
+        raise ScanError(text, place=place)
+    if np.abs(K[:2, 2]).max() > MAX_CENTRE * size:
+        text = f"K has its centre at {K[0, 2]:.4g}, {K[1, 2]:.4g} px, expected at most {MAX_CENTRE * size:g} px"
+        raise ScanError(text, place=place)
+    if np.abs(camera.distortion).max() > MAX_DISTORTION:
+        raise ScanError(f"distortion has a term beyond ±{MAX_DISTORTION:g}", place=place)
+    return camera
 
 
 def make_rig(depth: Camera, color: Camera | None = None, T_color_depth: NDArray | None = None, *, place: object) -> Rig:

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-import csv
+import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-import scipy.io
 from numpy.typing import NDArray
 
 from ...errors import ScanError
+from ...files.reading import read_bytes
+from ...files.table import table_rows
 from .board import Board
+from .matlab import MAX_UNPACKED_BYTES, read_matlab
 from .views import CAMERAS, BoardPoints, BoardView
 
+MAX_PICK_PX = 100_000  # no image is as wide
+VARIABLES = ("rgb_grid_x", "rgb_grid_p", "rfiles", "rsize")  # of the toolbox's file
 INTERPOLATED_PX = 0.05  # px; no picture places a point this exactly on a grid again and again
 
 
@@ -24,31 +29,23 @@ def read_picks_csv(path: Path, board: Board) -> list[BoardView]:
     Raises ScanError naming the line.
     """
     table: dict[str, dict[str, list[tuple[int, float, float]]]] = {}
-    try:
-        with path.open(newline="", encoding="utf-8") as f:
-            reader = csv.DictReader(f)
-            missing = {"view", "camera", "point", "u_px", "v_px"} - set(reader.fieldnames or ())
-            if missing:
-                raise ScanError(f"column(s) {', '.join(sorted(missing))} are missing", place=path)
-            for number, row in enumerate(reader, 2):
-                place = f"{path}, line {number}"
-                try:
-                    point, u, v = int(row["point"]), float(row["u_px"]), float(row["v_px"])
-                except (TypeError, ValueError):
-                    raise ScanError("point, u_px and v_px must be numbers", place=place) from None
-                if row["camera"] not in CAMERAS:
-                    raise ScanError(f"camera '{row['camera']}' is none of {', '.join(CAMERAS)}", place=place)
-                if not 0 <= point < len(board):
-                    raise ScanError(
-                        f"point {point} does not exist on a board of {board.columns} x {board.rows}",
-                        place=place,
-                        hint="check --columns and --rows",
-                    )
-                table.setdefault(row["view"], {}).setdefault(row["camera"], []).append((point, u, v))
-    except FileNotFoundError:
-        raise ScanError("there is no such picks file", place=path) from None
-    except (UnicodeDecodeError, csv.Error) as e:
-        raise ScanError(f"it cannot be read as CSV ({e})", place=path) from None
+    for number, row in table_rows(path, "picks", ("view", "camera", "point", "u_px", "v_px")):
+        place = f"{path}, line {number}"
+        try:
+            point, u, v = int(row["point"]), float(row["u_px"]), float(row["v_px"])
+        except ValueError:
+            raise ScanError("point, u_px and v_px must be numbers", place=place) from None
+        if row["camera"] not in CAMERAS:
+            raise ScanError(f"camera '{row['camera'][:40]}' is none of {', '.join(CAMERAS)}", place=place)
+        if not 0 <= point < len(board):
+            raise ScanError(
+                f"point {row['point'][:40]} does not exist on a board of {board.columns} x {board.rows}",
+                place=place,
+                hint="check --columns and --rows",
+            )
+        if not (abs(u) <= MAX_PICK_PX and abs(v) <= MAX_PICK_PX):
+            raise ScanError(f"u_px and v_px must lie within ±{MAX_PICK_PX} px", place=place)
+        table.setdefault(row["view"], {}).setdefault(row["camera"], []).append((point, u, v))
     views = []
     for name, cameras in table.items():
         arrays = {c: np.array(rows) for c, rows in cameras.items()}
@@ -67,30 +64,39 @@ def read_picks_mat(path: Path, spacing_m: float) -> tuple[Board, dict[str, tuple
     [px], as its projection code has it. Raises ScanError if a variable is absent or shaped otherwise.
     """
     try:
-        m = scipy.io.loadmat(path)
-        grid = np.asarray(_cells(_cells(m["rgb_grid_x"])[0])[0], np.float64)
-        picks = [_cells(c) for c in _cells(m["rgb_grid_p"])]
-        names = [_text(c) for c in _cells(_cells(m["rfiles"])[0])]
-        sizes = [np.ravel(c) for c in _cells(m["rsize"])]
-    except FileNotFoundError:
-        raise ScanError("there is no such picks file", place=path) from None
-    except (KeyError, IndexError, ValueError, NotImplementedError, TypeError) as e:
-        raise ScanError(f"not a picks file of the toolbox ({e})", place=path, hint="export the picks as CSV") from None
-    columns = len(np.unique(np.round(grid[0] / _step(grid[0]))))
-    rows = len(np.unique(np.round(grid[1] / _step(grid[1]))))
-    if columns * rows != grid.shape[1]:
-        raise ScanError(f"{grid.shape[1]} points are no grid of {columns} x {rows}", place=path)
-    board = Board("pins", columns, rows, spacing_m)
-    order = np.round(grid[1] / _step(grid[1])).astype(int) * columns + np.round(grid[0] / _step(grid[0])).astype(int)
+        data = read_bytes(path, "picks", limit_bytes=MAX_UNPACKED_BYTES)
+        return _toolbox_picks(read_matlab(data, VARIABLES), spacing_m)
+    except ScanError as e:
+        raise ScanError(e.cause, place=path, hint=e.hint) from None
+    except (LookupError, ValueError, TypeError, OverflowError, StopIteration, zlib.error) as e:
+        why = f"not a picks file of the toolbox ({type(e).__name__})"
+        raise ScanError(why, place=path, hint="export the picks as CSV") from None
+
+
+def _toolbox_picks(m: Mapping[str, Any], spacing_m: float) -> tuple[Board, dict[str, tuple[int, int]], list[BoardView]]:
+    grid = np.asarray(_cells(_cells(m["rgb_grid_x"])[0])[0], np.float64)
+    picks = [_cells(c) for c in _cells(m["rgb_grid_p"])]
+    names = [_text(c) for c in _cells(_cells(m["rfiles"])[0])]
+    sizes = [np.ravel(c) for c in _cells(m["rsize"])]
+    if not np.all(np.abs(grid) <= MAX_PICK_PX):
+        raise ScanError("the board's points are no finite numbers")
+    column, row = (np.round(axis / _step(axis)).astype(np.int64) for axis in grid[:2])
+    columns, rows = len(np.unique(column)), len(np.unique(row))
+    order = row * columns + column
+    if columns * rows != len(order) or not np.array_equal(np.sort(order), np.arange(len(order))):
+        raise ScanError(f"{grid.shape[1]} points are no grid of {columns} x {rows}")
     views = []
     for k, name in enumerate(names):
         points = {}
         for camera, cells in zip(CAMERAS, picks, strict=False):
             if k < len(cells) and np.size(cells[k]):
-                points[camera] = BoardPoints(order, np.asarray(cells[k], np.float64).T)
+                px = np.asarray(cells[k], np.float64).T
+                if np.nanmax(np.abs(px), initial=0) > MAX_PICK_PX:
+                    raise ScanError(f"view '{name}' has a point beyond ±{MAX_PICK_PX} px")
+                points[camera] = BoardPoints(order, px)
         views.append(BoardView(Path(name).stem, points))
     image_size = {c: (int(s[1]), int(s[0])) for c, s in zip(CAMERAS, sizes, strict=False)}
-    return board, image_size, views
+    return Board("pins", columns, rows, spacing_m), image_size, views
 
 
 def interpolated(points: BoardPoints, board: Board) -> NDArray[np.bool_] | None:

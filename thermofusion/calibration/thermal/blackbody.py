@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from pydantic import Field
 
 from ...errors import ScanError
-from ...files.reading import inside, read_bytes, read_json, read_text
+from ...files.npz import read_npz
+from ...files.reading import inside, read_json
 from ...files.strict import Border, validated
+from ...files.table import table_rows
 from ...files.whole import replacing, write_text
-from ...scans.native.schema import SignalDoc
+from ...scans.native.schema import Constant, SignalDoc
 from ...types import Float, SignalCurve
 from .radiometric import PixelField, RadiometricCurve, check_monotone
 from .source import ThermalSource
@@ -59,19 +59,15 @@ class Reading:
 def read_readings(path: Path) -> list[Reading]:
     """Rows `counts,degC`, or `file,degC` with paths beside the table and, if the source does not fill the picture,
     `left_px,top_px,width_px,height_px`. Raises ScanError naming the line."""
-    try:
-        reader = csv.DictReader(io.StringIO(read_text(path, "readings"), newline=""))
-        columns = set(reader.fieldnames or ())
-        rows = list(reader)
-    except csv.Error as e:
-        raise ScanError(f"it cannot be read as CSV ({e})", place=path) from None
-    if "degC" not in columns or not columns & {"counts", "file"}:
+    rows = list(table_rows(path, "readings", ["degC"]))
+    if not rows:
+        raise ScanError("there are no readings", place=path)
+    columns = set(rows[0][1])
+    if not columns & {"counts", "file"}:
         raise ScanError("the columns must be counts,degC or file,degC", place=path)
     if 0 < len(columns & set(BOX)) < 4:
         raise ScanError(f"column(s) {', '.join(sorted(set(BOX) - columns))} are missing", place=path)
-    if not rows:
-        raise ScanError("there are no readings", place=path)
-    return [_reading(row, path, f"{path}, line {n}") for n, row in enumerate(rows, 2)]
+    return [_reading(row, path, f"{path}, line {n}") for n, row in rows]
 
 
 def _reading(row: dict[str, str], path: Path, place: str) -> Reading:
@@ -105,9 +101,9 @@ def _median_counts(reading: Reading, opener: Opener) -> float:
 class _CurveDoc(Border):
     schema_: Literal["thermofusion-curve/1"]
     signal: SignalDoc
-    counts_range: tuple[float, float]
-    residual_K: float
-    sigma_K: float
+    counts_range: tuple[Constant, Constant]
+    residual_K: float = Field(ge=0, le=1000)
+    sigma_K: float = Field(ge=0, le=1000)
 
 
 def signal_document(signal: SignalCurve) -> dict[str, Any]:
@@ -150,7 +146,8 @@ def read_curve(path: Path) -> RadiometricCurve:
     if not lo < hi:
         raise ScanError("key 'counts_range': expected low < high", place=path)
     parameters = tuple(float(v) for v in values if v is not None)
-    check_monotone(c.type, parameters, (lo, hi))
+    with np.errstate(all="ignore"):  # a curve that has no value somewhere is refused for it
+        check_monotone(c.type, parameters, (lo, hi))
     return RadiometricCurve(c.type, parameters, (lo, hi), doc.residual_K, doc.sigma_K)
 
 
@@ -162,14 +159,7 @@ def write_field(path: Path, field: PixelField) -> None:
 
 def read_field(path: Path) -> PixelField:
     """Read a pixel field. Raises ScanError if the file is none."""
-    data = read_bytes(path, "field")
-    try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as stored:
-            z = stored["z"]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile):
-        raise ScanError(
-            "this is no pixel field", place=path, hint="write one with `thermofusion thermal field`"
-        ) from None
+    (z,) = read_npz(path, "pixel field", ["z"], hint="write one with `thermofusion thermal field`")
     if z.ndim != 3 or z.dtype.kind != "f" or not np.isfinite(z).all():
         raise ScanError("a pixel field holds finite `z` of three axes: power, row, column", place=path)
     return PixelField(z.astype(np.float32))

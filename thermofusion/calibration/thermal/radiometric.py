@@ -139,7 +139,7 @@ def check_monotone(kind: str, parameters: tuple[float, ...], counts_range: tuple
     if not np.isfinite(T).all():
         raise ScanError(f"the radiometric curve has no value at {g[~np.isfinite(T)][0]:.0f} counts")
     if not ((step > 0).all() or (step < 0).all()):
-        turn = g[:-1][np.sign(step) != np.sign(np.median(step))]
+        turn = g[:-1][np.sign(step) != (np.sign(np.median(step)) or 1)]
         raise ScanError(
             f"the radiometric curve turns between {turn[0]:.0f} and {turn[-1]:.0f} counts, inside its range",
             hint="take fewer powers, or more blackbody readings there",

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import ScanError
-from ...files.reading import decode_image, read_text
+from ...files.reading import decode_image, text_lines
 from ...files.tum import poses_to_trajectory
 from ...types import Float, Scan
 from ..common import ImageFiles, frame_times, image_size, image_stream, make_camera, make_rig, numbered
@@ -84,7 +84,7 @@ def _info(path: Path) -> dict[str, list[list[float]]]:
     """Matrices by the comment line above them, in lower case."""
     groups: dict[str, list[list[float]]] = {}
     title = ""
-    for number, line in enumerate(read_text(path).splitlines(), 1):
+    for number, line in enumerate(text_lines(path), 1):
         if line.startswith("#"):
             title = line[1:].strip().lower()
             groups[title] = []
@@ -98,6 +98,7 @@ def _info(path: Path) -> dict[str, list[list[float]]]:
 
 def _entry(info: dict[str, list[list[float]]], title: str, path: Path, shape: tuple[int, int]) -> Float:
     rows = next((rows for key, rows in info.items() if re.search(re.escape(title), key)), None)
-    if rows is None or [len(r) for r in rows] != [shape[1]] * shape[0]:
-        raise ScanError(f"expected a {shape[0]}x{shape[1]} matrix under '{title}'", place=path / "cam.info.txt")
+    if rows is None or [len(r) for r in rows] != [shape[1]] * shape[0] or not np.isfinite(rows).all():
+        text = f"expected a {shape[0]}x{shape[1]} matrix of finite numbers under '{title}'"
+        raise ScanError(text, place=path / "cam.info.txt")
     return np.array(rows)

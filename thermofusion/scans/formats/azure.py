@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import ScanError
-from ...files.reading import decode_image, parse_json
+from ...files.reading import decode_image, open_regular, parse_json, read_head
 from ...geometry.rigid import invert, pose
 from ...types import Camera, Float, Scan, Stream
 from ..common import Kind, as_loaded, make_camera, make_rig, make_stream
@@ -43,13 +43,7 @@ _LOCATIONS = {"depth": "CALIBRATION_CameraLocationD0", "color": "CALIBRATION_Cam
 
 def recognise(path: Path) -> bool:
     """A file that begins like Matroska and is named .mkv."""
-    if path.suffix.lower() != ".mkv" or not path.is_file():
-        return False
-    try:
-        with path.open("rb") as f:
-            return f.read(4) == b"\x1a\x45\xdf\xa3"
-    except OSError:
-        return False
+    return path.suffix.lower() == ".mkv" and read_head(path, 4) == b"\x1a\x45\xdf\xa3"
 
 
 def read(path: Path) -> Scan:
@@ -135,7 +129,7 @@ def azure_camera(calibration: Any, which: str, width_px: int, height_px: int, pl
 
 def _map(path: Path) -> memoryview:
     try:
-        with path.open("rb") as f:
+        with open_regular(path, "recording", limit_bytes=None) as f:
             return memoryview(mmap.mmap(f.fileno(), 0, access=mmap.ACCESS_READ))
     except (OSError, ValueError) as e:  # ValueError: an empty file
         raise ScanError(f"the recording cannot be read ({e})", place=path) from None

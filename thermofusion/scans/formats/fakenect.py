@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ...errors import ScanError
 from ...files.pnm import read_pnm
-from ...files.reading import inside, read_bytes, read_text
+from ...files.reading import inside, read_bytes, read_head, text_lines
 from ...geometry.rigid import pose
 from ...types import Float, Scan
 from ..common import ImageFiles, image_stream, make_camera, make_rig
@@ -73,14 +73,7 @@ class _Entry:
 
 def recognise(path: Path) -> bool:
     """INDEX.txt with at least one depth frame's name in it."""
-    index = path / "INDEX.txt"
-    if not index.is_file():
-        return False
-    try:
-        with index.open("rb") as f:
-            return re.search(rb"^d-[\d.]+-\d+\.pgm", f.read(65536), re.MULTILINE) is not None
-    except OSError:
-        return False
+    return re.search(rb"^d-[\d.]+-\d+\.pgm", read_head(path / "INDEX.txt", 65536), re.MULTILINE) is not None
 
 
 def read(path: Path, constants: KinectDepth = KinectDepth()) -> Scan:
@@ -158,7 +151,7 @@ def read_acceleration(data: bytes, place: object = None) -> tuple[Float, float, 
 def _entries(path: Path) -> list[_Entry]:
     index = path / "INDEX.txt"
     entries = []
-    for number, line in enumerate(read_text(index, "INDEX.txt").splitlines(), 1):
+    for number, line in enumerate(text_lines(index, "INDEX.txt"), 1):
         if not line.strip():
             continue
         match = _NAME.match(line.strip())

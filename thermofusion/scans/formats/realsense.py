@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import ScanError
-from ...files.reading import read_image
+from ...files.reading import read_head, read_image
 from ...types import Scan
 from ..common import Kind, as_loaded, make_camera, make_rig, make_stream
 
@@ -26,11 +26,7 @@ MAGIC = b"#ROSBAG V2.0"
 
 def recognise(path: Path) -> bool:
     """A file that begins like a ROS bag."""
-    try:
-        with path.open("rb") as f:
-            return f.read(len(MAGIC)) == MAGIC
-    except OSError:
-        return False
+    return read_head(path, len(MAGIC)) == MAGIC
 
 
 def read(path: Path) -> Scan:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import ScanError
-from ...files.reading import read_json, read_text
+from ...files.reading import is_named, read_json, text_lines
 from ...files.tum import poses_to_trajectory
 from ...types import Camera, Float, Scan, Trajectory
 from ..common import (
@@ -50,7 +50,7 @@ def read(path: Path) -> Scan:
         raise ScanError("only one of colour and depth carries time stamps in its names", place=path)
     if not stamped:
         notes.append("the recording carries no times: 30 frames a second by number are assumed")
-    log = next((path / n for n in ("trajectory.log", "odometry.log") if (path / n).is_file()), None)
+    log = next((path / n for n in ("trajectory.log", "odometry.log") if is_named(path / n)), None)
     color = None
     if color_paths:
         color = image_stream(ImageFiles("color", color_paths, color_times, path, color_index), camera)
@@ -89,7 +89,7 @@ def _times(files: list[Path]) -> tuple[Float, list[int], list[Path], bool]:
 def _camera(path: Path, first_depth: Path) -> tuple[Camera, list[str]]:
     width, height = image_size(first_depth, "depth")
     for file in (path / "camera_intrinsic.json", path / "intrinsic.json"):
-        if not file.is_file():
+        if not is_named(file):
             continue
         tree = read_json(file)
         try:
@@ -117,7 +117,7 @@ def _trajectory(log: Path, depth_times: Float) -> Trajectory:
 
 def _rows(log: Path) -> list[list[float]]:
     rows = []
-    for number, line in enumerate(read_text(log).splitlines(), 1):
+    for number, line in enumerate(text_lines(log), 1):
         try:
             row = [float(w) for w in line.split()]
         except ValueError:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import ScanError
-from ...files.reading import read_numbers
+from ...files.reading import is_named, read_numbers
 from ...files.tum import poses_to_trajectory
 from ...geometry.rigid import pose
 from ...types import Scan, Trajectory
@@ -37,8 +37,8 @@ def read(path: Path) -> Scan:
     numbers, files = [n for n, _ in depth], [f for _, f in depth]
     width, height = image_size(files[0], "depth")
     own = path / "camera-intrinsics.txt"
-    K = read_numbers(own, columns=3) if own.is_file() else PUBLISHED_K
-    camera = make_camera(width, height, K, place=own if own.is_file() else path)
+    K = read_numbers(own, columns=3) if is_named(own) else PUBLISHED_K
+    camera = make_camera(width, height, K, place=own if is_named(own) else path)
     notes = ["the recording carries no times: 30 frames a second by number are assumed"]
     color_camera, color = None, None
     color_frames = _frames(path, "color")
@@ -73,7 +73,7 @@ def _poses(path: Path, numbers: list[int]) -> tuple[Trajectory | None, int]:
     kept, poses, lost = [], [], 0
     for n in numbers:
         file = path / f"frame-{n:06d}.pose.txt"
-        if not file.is_file():
+        if not is_named(file):
             continue
         T = read_numbers(file, columns=4)
         if T.shape != (4, 4):

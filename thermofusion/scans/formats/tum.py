@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import ScanError
-from ...files.reading import inside, read_text
+from ...files.reading import inside, is_named, text_lines
 from ...files.tum import read_trajectory
 from ...types import Camera, Scan, Stream
 from ..common import NOMINAL_K, ImageFiles, Kind, image_size, image_stream, make_camera, make_rig
@@ -57,7 +57,7 @@ def read(path: Path) -> Scan:
         rig=make_rig(camera, camera, place=path),
         depth=image_stream(ImageFiles("depth", files, times, path / "depth.txt"), camera, unit_m=unit_m),
         color=_stream(path, "rgb.txt", "color", camera),
-        trajectory=read_trajectory(truth) if truth.is_file() else None,
+        trajectory=read_trajectory(truth) if is_named(truth) else None,
         depth_unit_m=unit_m,
         notes=tuple(notes),
     )
@@ -71,7 +71,7 @@ def _stream(path: Path, name: str, kind: Kind, camera: Camera) -> Stream:
 def _list(root: Path, name: str) -> tuple[list[float], list[Path]]:
     """Rows `timestamp path`."""
     times, files = [], []
-    for number, line in enumerate(read_text(root / name).splitlines(), 1):
+    for number, line in enumerate(text_lines(root / name), 1):
         words = line.split("#")[0].split()
         if not words:
             continue

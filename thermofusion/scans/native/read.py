@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
+import os
+import stat
+from array import array
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from ...errors import ScanError
-from ...files.reading import COPY_AGAIN, inside, read_json, read_text
+from ...files.reading import COPY_AGAIN, MAX_NAME, inside, is_named, read_json
 from ...files.strict import validated
+from ...files.table import table_rows
 from ...files.tum import read_trajectory
 from ...types import Camera, Environment, Scan, Stream
 from ..common import ImageFiles, as_thermal, image_stream
@@ -24,7 +28,7 @@ COLUMNS = ("stream", "index", "time_s", "path")  # of frames.csv; `shutter` and 
 
 def is_native(root: Path) -> bool:
     """A scan.json or a frames.csv is there: without the other one it is a torn scan, not a foreign one."""
-    return (root / "scan.json").is_file() or (root / "frames.csv").is_file()
+    return is_named(root / "scan.json") or is_named(root / "frames.csv")
 
 
 def read_native(root: Path) -> Scan:
@@ -33,7 +37,7 @@ def read_native(root: Path) -> Scan:
     Raises ScanError with the file, the key and what was expected.
     """
     path = root / "scan.json"
-    if not path.exists():
+    if not is_named(path):
         raise ScanError("there is no scan.json here", place=root, hint="give a scan folder")
     doc = validated(ScanDoc, read_json(path), path)
     rig, group = rig_of(doc.cameras, doc.extrinsics, path), doc.cameras.thermal
@@ -55,8 +59,10 @@ def read_native(root: Path) -> Scan:
         color=streams.get("color"),
         thermal=as_thermal(streams["thermal"], camera) if camera is not None and "thermal" in streams else None,
         environment=Environment(**{k: getattr(doc.environment, k) for k in Environment.__dataclass_fields__}),
-        references=tuple(reference_of(r) for r in doc.references),
-        trajectory=read_trajectory(trajectory_file) if trajectory_file.exists() else None,
+        references=tuple(
+            reference_of(r, f"references.{i}", cameras["thermal"], path) for i, r in enumerate(doc.references)
+        ),
+        trajectory=read_trajectory(trajectory_file) if is_named(trajectory_file) else None,
         depth_unit_m=unit_m,
         depth_up=doc.cameras.depth.up,
         recorded_at=doc.recorded_at,
@@ -65,78 +71,99 @@ def read_native(root: Path) -> Scan:
     )
 
 
-@dataclass(frozen=True)
-class _Row:
-    stream: str
-    index: int
-    time_s: float
-    file: Path
-    usable: bool
+@dataclass
+class _Frames:
+    """One stream's rows of frames.csv, as columns: a row costs little."""
+
+    index: array[int] = field(default_factory=lambda: array("q"))
+    times_s: array[float] = field(default_factory=lambda: array("d"))
+    files: list[str] = field(default_factory=list)
+    usable: bytearray = field(default_factory=bytearray)
 
 
 def _read_frames(root: Path, cameras: Mapping[str, Camera | None], unit_m: float) -> dict[str, Stream]:
     path = root / "frames.csv"
-    if not path.exists():
+    if not is_named(path):
         raise ScanError("there is no frames.csv here", place=root)
-    try:
-        reader = csv.DictReader(io.StringIO(read_text(path, "frames.csv"), newline=""))
-        missing = set(COLUMNS) - set(reader.fieldnames or ())
-        table = list(reader)
-    except csv.Error as e:
-        raise ScanError(f"it cannot be read as CSV ({e})", place=path) from None
-    if missing:
-        raise ScanError(f"column(s) {', '.join(sorted(missing))} are missing", place=path)
+    found: dict[str, _Frames] = {}
+    files = _Files(root)
+    for number, row in table_rows(path, "frames.csv", COLUMNS):
+        try:
+            kind, index, time_s, file, usable = _row(row, files)
+        except ScanError as e:
+            raise ScanError(e.cause, place=e.place or f"{path}, line {number}", hint=e.hint) from None
+        frames = found.setdefault(kind, _Frames())
+        frames.index.append(index)
+        frames.times_s.append(time_s)
+        frames.files.append(file)
+        frames.usable.append(usable)
 
-    rows = [_row(root, row, f"{path}, line {number}") for number, row in enumerate(table, 2)]
     streams: dict[str, Stream] = {}
     for kind in STREAMS:
-        camera = cameras[kind]
-        own = [r for r in rows if r.stream == kind]
-        if not own:
+        camera, own = cameras[kind], found.get(kind)
+        if own is None:
             continue
         if camera is None:
             raise ScanError(f"{kind} frames are listed, but scan.json has no 'cameras.{kind}'", place=path)
-        _check_files(own, path)
-        files = ImageFiles(
-            kind,
-            [r.file for r in own],
-            [r.time_s for r in own],
-            path,
-            [r.index for r in own],
-            [r.usable for r in own],
-        )
-        streams[kind] = image_stream(files, camera, unit_m=unit_m)
+        numbers, flags = np.array(own.index, np.int64), np.frombuffer(own.usable, np.bool_)
+        if len(np.unique(numbers)) < len(numbers):
+            raise ScanError(f"an index of the {kind} stream stands twice", place=path)
+        images = ImageFiles(kind, own.files, np.array(own.times_s), path, numbers, flags)
+        streams[kind] = image_stream(images, camera, unit_m=unit_m)
     return streams
 
 
-def _row(root: Path, row: dict[str, str], place: str) -> _Row:
-    stream = (row["stream"] or "").strip()
+def _row(row: Mapping[str, str], files: _Files) -> tuple[str, int, float, str, bool]:
+    """Stream, index, time [s], file, usable. Raises ScanError, without a place where the row itself is wrong."""
+    stream = row["stream"]
     if stream not in STREAMS:
-        raise ScanError(f"stream '{stream[:40]}' is none of {', '.join(STREAMS)}", place=place)
+        raise ScanError(f"stream '{stream[:40]}' is none of {', '.join(STREAMS)}")
     try:
         index, time_s = int(row["index"]), float(row["time_s"])
-    except (TypeError, ValueError):
-        raise ScanError("index must be a whole number and time_s a number", place=place) from None
+    except ValueError:
+        raise ScanError("index must be a whole number and time_s a number") from None
     if not 0 <= index < 2**31:
-        raise ScanError(f"index {index} is not within 0 and 2^31", place=place)
+        raise ScanError(f"index {row['index'][:40]} is not within 0 and 2^31")
     if not math.isfinite(time_s):
-        raise ScanError("time_s is not finite", place=place)
-    name = (row["path"] or "").strip()
-    if not name:
-        raise ScanError("the path is empty", place=place)
-    shutter = (row.get("shutter") or "").strip().lower() not in ("", "0", "false", "no")
-    return _Row(stream, index, time_s, inside(root, name, place=place), not shutter)
+        raise ScanError("time_s is not finite")
+    if not row["path"]:
+        raise ScanError("the path is empty")
+    usable = row.get("shutter", "").lower() in ("", "0", "false", "no")
+    return stream, index, time_s, files.find(row["path"], stream), usable
 
 
-def _check_files(rows: list[_Row], path: Path) -> None:
-    """Every file named once, there, and a regular one; every index once."""
-    if len({r.index for r in rows}) < len(rows):
-        raise ScanError(f"an index of the {rows[0].stream} stream stands twice", place=path)
-    for r in rows:
+class _Files:
+    """The files that a table names: inside the scan's folder, there, regular; each folder is resolved once."""
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+        self._known: dict[str, str] = {}
+        self._folders: dict[str, str] = {}
+
+    def find(self, name: str, kind: str) -> str:
+        """The file's path. Raises ScanError, with a place only where the row is right and the file is not."""
+        if name not in self._known:
+            self._known[name] = self._found(name, kind)
+        return self._known[name]
+
+    def _found(self, name: str, kind: str) -> str:
+        head, _, tail = name.rpartition("/")
+        path = name
         try:
-            regular = r.file.is_file()
-        except OSError:
-            regular = False
-        if not regular:
-            what = "no regular file" if r.file.exists() else "absent"
-            raise ScanError(f"the {r.stream} file is named in frames.csv but {what}", place=r.file, hint=COPY_AGAIN)
+            if os.sep == "/" and name[0] != "/" and len(name) <= MAX_NAME:
+                if head not in self._folders:
+                    self._folders[head] = str(inside(self._root, head, place=None))
+                path = f"{self._folders[head]}/{tail}"
+                if stat.S_ISREG(os.lstat(path).st_mode):
+                    return path
+            path = str(inside(self._root, name, place=None))  # a link, or `..`: resolved as a whole
+            if not stat.S_ISREG(Path(path).stat().st_mode):
+                raise ScanError(f"the {kind} file is named in frames.csv but no regular file", place=path)
+        except FileNotFoundError:
+            text = f"the {kind} file is named in frames.csv but absent"
+            raise ScanError(text, place=path, hint=COPY_AGAIN) from None
+        except OSError as e:
+            raise ScanError(f"the {kind} file cannot be read ({e.strerror})", place=path) from None
+        except ValueError as e:
+            raise ScanError(f"the path {name[:80]!r} is not usable ({type(e).__name__})") from None
+        return path

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, field_validator
 
 from ...errors import ScanError
 from ...files.strict import Border
@@ -15,21 +16,31 @@ from ..common import Kind, make_camera, make_rig
 
 SCHEMA = "thermofusion-scan/1"
 STREAMS: tuple[Kind, ...] = ("depth", "color", "thermal")
+MAX_BASELINE_M = 10.0  # between cameras of one rig: more is in other units than metres
+MIN_BAND_UM = 0.1  # width of a thermal camera's band
+MIN_POLYGON_PX2 = 1.0  # area of a reference in the thermal image
+UP_LENGTH = (0.1, 100.0)  # of the `up` vector: a unit vector, or an accelerometer's m/s²
+
+Constant = Annotated[float, Field(ge=-1e12, le=1e12)]  # of a radiometric curve: Planck's R reaches 1e9
+Celsius = Annotated[float, Field(ge=-273.15, le=5000)]
+Metres = Annotated[float, Field(ge=-1000, le=1000)]
+Pixels = Annotated[float, Field(ge=-0.5, le=32767)]
+FrameIndex = Annotated[int, Field(ge=0, lt=2**31)]
 
 
 class CurveDoc(Border):
     """`signal.curve`: counts to temperature."""
 
     type: Literal["polynomial", "linear_kelvin", "planck", "table"]
-    coefficients_degC: list[float] | None = None
-    gain_K: float | None = None
-    offset_K: float | None = None
-    R: float | None = None
-    B: float | None = None
-    F: float | None = None
-    O: float | None = None  # noqa: E741 - the Planck curve's own letter
-    counts: list[float] | None = None
-    degC: list[float] | None = None
+    coefficients_degC: list[Constant] | None = Field(None, max_length=16)
+    gain_K: Constant | None = None
+    offset_K: Constant | None = None
+    R: Constant | None = None
+    B: float | None = Field(None, ge=1, le=1e6)  # K: 14388 over the wavelength in µm
+    F: Constant | None = None
+    O: Constant | None = None  # noqa: E741 - the Planck curve's own letter
+    counts: list[Constant] | None = Field(None, max_length=65536)
+    degC: list[Celsius] | None = Field(None, max_length=65536)
 
 
 class SignalDoc(Border):
@@ -56,15 +67,22 @@ class DepthCameraDoc(CameraDoc):
     depth_unit_m: float = Field(0.001, gt=1e-6, le=0.1)
     up: tuple[float, float, float] = (0.0, -1.0, 0.0)
 
+    @field_validator("up")
+    @classmethod
+    def _is_a_direction(cls, up: tuple[float, float, float]) -> tuple[float, float, float]:
+        if not UP_LENGTH[0] <= math.hypot(*up) <= UP_LENGTH[1]:
+            raise ValueError(f"expected a direction: three numbers, together {UP_LENGTH[0]} to {UP_LENGTH[1]:g} long")
+        return up
+
 
 class ThermalCameraDoc(CameraDoc):
     """The thermal camera."""
 
     signal: SignalDoc
     band_um: tuple[float, float] = (7.5, 13.5)
-    netd_K: float = Field(0.05, gt=0)
+    netd_K: float = Field(0.05, ge=0.0001, le=5)
     time_offset_s: float = Field(0.0, ge=-3600, le=3600)
-    psf_sigma_px: float | None = Field(None, gt=0)
+    psf_sigma_px: float | None = Field(None, ge=0.01, le=20)
 
 
 class CamerasDoc(Border):
@@ -85,8 +103,8 @@ class ExtrinsicsDoc(Border):
 class EnvironmentDoc(Border):
     """`environment`: the room."""
 
-    reflected_degC: float | None = Field(None, gt=-100, lt=200)
-    air_degC: float | None = Field(None, gt=-100, lt=200)
+    reflected_degC: float | None = Field(None, ge=-80, le=150)
+    air_degC: float | None = Field(None, ge=-60, le=80)
     relative_humidity_pct: float | None = Field(None, ge=0, le=100)
 
 
@@ -94,32 +112,42 @@ class BlackbodyDoc(Border):
     """A source of known temperature in some thermal frames."""
 
     kind: Literal["blackbody"]
-    degC: float = Field(gt=-100, lt=1000)
-    uncertainty_K: float = Field(ge=0)
-    emissivity: float = Field(1.0, gt=0, le=1)
-    thermal_polygon_px: list[tuple[float, float]] = Field(min_length=3)
-    frames: list[int]
+    degC: float = Field(ge=-50, le=150)
+    uncertainty_K: float = Field(ge=0, le=10)
+    emissivity: float = Field(1.0, ge=0.5, le=1)
+    thermal_polygon_px: list[tuple[Pixels, Pixels]] = Field(min_length=3, max_length=1000)
+    frames: list[FrameIndex] = Field(min_length=1, max_length=1_000_000)
+
+    @field_validator("thermal_polygon_px")
+    @classmethod
+    def _has_an_area(cls, polygon: list[tuple[float, float]]) -> list[tuple[float, float]]:
+        u, v = np.array(polygon).T
+        if abs(u @ np.roll(v, -1) - v @ np.roll(u, -1)) / 2 < MIN_POLYGON_PX2:
+            raise ValueError("the polygon encloses less than a pixel")
+        return polygon
 
 
 class ContactDoc(Border):
     """A thermometer on the skin."""
 
     kind: Literal["contact"]
-    degC: float = Field(gt=-100, lt=1000)
-    uncertainty_K: float = Field(ge=0)
-    p_world_m: tuple[float, float, float]
+    degC: float = Field(ge=-50, le=150)
+    uncertainty_K: float = Field(ge=0, le=10)
+    p_world_m: tuple[Metres, Metres, Metres]
 
 
 class ScanDoc(Border):
     """scan.json."""
 
     schema_: Literal["thermofusion-scan/1"] = Field(alias="schema")
-    name: str = "scan"
-    recorded_at: str | None = None
+    name: str = Field("scan", max_length=200)
+    recorded_at: str | None = Field(None, max_length=100)
     cameras: CamerasDoc
     extrinsics: ExtrinsicsDoc = ExtrinsicsDoc()
     environment: EnvironmentDoc = EnvironmentDoc()
-    references: list[Annotated[BlackbodyDoc | ContactDoc, Field(discriminator="kind")]] = Field(default_factory=list)
+    references: list[Annotated[BlackbodyDoc | ContactDoc, Field(discriminator="kind")]] = Field(
+        default_factory=list, max_length=1000
+    )
     subject: dict[str, Any] = Field(default_factory=dict)
     notes: list[str] = Field(default_factory=list)
 
@@ -148,7 +176,7 @@ class DepthCorrectionDoc(Border):
     """What calibration found of the depth camera's own error (`calibration.fit.depth_model`)."""
 
     model: Literal["metric", "disparity"]
-    parameters: dict[str, float]
+    parameters: dict[str, Annotated[float, Field(ge=-10_000, le=10_000)]]
 
 
 class RigDoc(Border):
@@ -159,7 +187,7 @@ class RigDoc(Border):
 
     cameras: RigCamerasDoc
     extrinsics: RigExtrinsicsDoc = RigExtrinsicsDoc()
-    covariances: dict[str, list[list[float]]] = Field(default_factory=dict)
+    covariances: dict[str, list[list[float]]] = Field(default_factory=dict, max_length=10)
     depth_correction: DepthCorrectionDoc | None = None
 
 
@@ -194,7 +222,10 @@ def matrix_of(rows: list[list[float]], key: str, path: Path) -> np.ndarray:
     """A transform (4, 4), rotation and translation [m], of a JSON list. Raises ScanError that names the key."""
     if [len(r) for r in rows] != [4] * 4:
         raise ScanError(f"key '{key}': expected a 4x4 matrix", place=path)
-    return np.array(rows, np.float64)
+    T = np.array(rows, np.float64)
+    if np.abs(T[:3, 3]).max() > MAX_BASELINE_M:
+        raise ScanError(f"key '{key}': cameras more than {MAX_BASELINE_M:g} m apart, expected metres", place=path)
+    return T
 
 
 _NEEDED = {
@@ -208,10 +239,9 @@ _NEEDED = {
 def thermal_camera_of(doc: ThermalCameraDoc, extrinsics: ExtrinsicsDoc, path: Path) -> ThermalCamera:
     """The thermal camera's group with its extrinsic as `ThermalCamera`; without a signal (a rig.json) the default."""
     lo, hi = doc.band_um
-    if not 1 <= lo < hi <= 30:
-        raise ScanError(
-            f"key 'cameras.thermal.band_um': expected two rising wavelengths in 1-30 um, got {lo}, {hi}", place=path
-        )
+    if not (lo >= 1 and lo + MIN_BAND_UM <= hi <= 30):
+        text = f"expected two wavelengths in 1-30 um that rise by at least {MIN_BAND_UM} um, got {lo}, {hi}"
+        raise ScanError(f"key 'cameras.thermal.band_um': {text}", place=path)
     lens, T = camera_of(doc, "cameras.thermal", path), _extrinsic(extrinsics, "thermal", path)
     signal = SignalCurve() if doc.signal is None else _signal(doc.signal, path)
     try:
@@ -253,10 +283,13 @@ def _curve_parameters(doc: CurveDoc, path: Path) -> dict[str, tuple[float, ...]]
     return p
 
 
-def reference_of(doc: BlackbodyDoc | ContactDoc) -> Reference:
-    """A reference group."""
+def reference_of(doc: BlackbodyDoc | ContactDoc, key: str, thermal: Camera | None, path: Path) -> Reference:
+    """A reference group; key : its own, for messages. A polygon must lie in the image of the thermal camera's lens."""
     if isinstance(doc, BlackbodyDoc):
         polygon = np.array(doc.thermal_polygon_px, np.float64)
+        if thermal is not None and (polygon > [thermal.width_px - 0.5, thermal.height_px - 0.5]).any():
+            size = f"{thermal.width_px} x {thermal.height_px} px"
+            raise ScanError(f"key '{key}.thermal_polygon_px': beyond the thermal image of {size}", place=path)
         return BlackbodyReference(doc.degC, doc.uncertainty_K, doc.emissivity, polygon, tuple(doc.frames))
     return ContactReference(doc.degC, doc.uncertainty_K, np.array(doc.p_world_m, np.float64))
 

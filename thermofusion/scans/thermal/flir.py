@@ -13,18 +13,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import ScanError
-from ...files.reading import MAX_PIXELS, claimed_size, read_bytes
+from ...files.reading import MAX_FILE_BYTES, decode_image, read_bytes, read_head
 from ...physics.band import ZERO_DEGC_K
 from ...types import Scan, SignalCurve
 from ..native.compose import ThermalFrames
 
 _RAW, _CAMERA = 0x01, 0x20  # types of FFF records: raw image, camera's parameters
 _MAGIC = b"FFF\0"
+MAX_FRAME_PIXELS = 8_000_000  # the largest thermal cameras have 3 million
+MAX_PIXELS = MAX_FILE_BYTES // 2  # of all frames: what the largest file holds unpacked
 
 
 @dataclass(frozen=True)
@@ -101,13 +102,11 @@ class FlirFrame:
 
 def recognise(path: Path) -> bool:
     """A .seq / .fff file, a JPEG that carries FLIR segments, or a folder of such JPEGs only."""
-    try:
-        if path.is_dir():
-            first = next(iter(sorted(path.glob("*.jpg"))), None)
-            return first is not None and b"FLIR\0" in _head(first)
-        return path.is_file() and (_head(path)[:4] == _MAGIC or b"FLIR\0" in _head(path))
-    except OSError:
-        return False
+    if path.is_dir():
+        first = next(iter(sorted(path.glob("*.jpg"))), None)
+        return first is not None and b"FLIR\0" in read_head(first, 65536)
+    head = read_head(path, 65536)
+    return head[:4] == _MAGIC or b"FLIR\0" in head
 
 
 def read(path: Path) -> Scan:
@@ -129,8 +128,12 @@ def read_thermal_frames(path: str | Path) -> ThermalFrames:
     path = Path(path)
     files = sorted(path.glob("*.jpg")) if path.is_dir() else [path]
     found: list[tuple[str, FlirFrame]] = []
+    pixels = 0
     for file in files:
         frames = parse(read_bytes(file, "thermal"), file)
+        pixels += sum(f.raw.size for f in frames)
+        if pixels > MAX_PIXELS:
+            raise ScanError(f"the frames have more than {MAX_PIXELS >> 20} million pixels", place=file)
         found += [(f"{file}, frame {i}" if len(frames) > 1 else str(file), f) for i, f in enumerate(frames)]
     if not found:
         raise ScanError("there are no radiometric JPEG here", place=path)
@@ -164,11 +167,6 @@ def parse(data: bytes, place: object = None) -> list[FlirFrame]:
         return [_frame(block, place) for block in _blocks(data, place)]
     except (struct.error, IndexError):
         raise ScanError("the FLIR data is truncated", place=place, hint="copy the recording again") from None
-
-
-def _head(path: Path) -> bytes:
-    with path.open("rb") as f:
-        return f.read(65536)
 
 
 def _from_jpeg(data: bytes, place: object) -> bytes:
@@ -235,15 +233,13 @@ def _order(record: bytes) -> str:
 def _raw_image(record: bytes, place: object) -> NDArray[np.uint16]:
     e = _order(record)
     w, h = struct.unpack_from(e + "HH", record, 2)
-    if not 0 < w * h <= MAX_PIXELS:
+    if not 0 < w * h <= MAX_FRAME_PIXELS:
         raise ScanError(f"the thermal image claims {w} x {h} px", place=place)
     body = record[0x20:]
     if body[:4] == b"\x89PNG":
-        if claimed_size(body) != (w, h):
-            raise ScanError("the thermal PNG's size is not the header's", place=place)
-        image = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_UNCHANGED)
-        if image is None or image.dtype != np.uint16 or image.shape != (h, w):
-            raise ScanError("the thermal PNG inside cannot be decoded", place=place)
+        image = decode_image(body, shape=(h, w), kind="thermal", place=place)
+        if image.dtype != np.uint16 or image.ndim != 2:
+            raise ScanError("the thermal PNG inside is no 16-bit grey", place=place)
         # FLIR stores little-endian samples where PNG has big-endian ones.
         return image.byteswap().astype(np.uint16, copy=False)
     if len(body) < 2 * w * h:
