@@ -7,7 +7,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NoReturn, TextIO
 
@@ -35,7 +35,8 @@ def leave(code: int) -> NoReturn:
 def fail(sentence: str, code: int, as_json: bool) -> NoReturn:
     """Print one sentence (or one JSON object) and exit with the code."""
     if as_json:
-        say(to_json({"error": sentence, "exit_code": code}))
+        with suppress(OSError):  # the code says it all the same
+            say(to_json({"error": sentence, "exit_code": code}))
     note(f"error: {sentence}")
     leave(code)
 
@@ -49,7 +50,12 @@ def say(text: str, stream: TextIO | None = None) -> None:
     if stream is not None:  # closed by whoever started us
         encoding = stream.encoding or "utf-8"
         shown = "\n".join(visible(line) for line in text.split("\n"))
-        print(shown.encode(encoding, "backslashreplace").decode(encoding), file=stream)
+        try:
+            print(shown.encode(encoding, "backslashreplace").decode(encoding), file=stream)
+        except BrokenPipeError:
+            if stream is sys.stdout:
+                leave(READER_GONE)
+            raise
 
 
 def emit(value: object, text: str, as_json: bool) -> None:
@@ -58,9 +64,10 @@ def emit(value: object, text: str, as_json: bool) -> None:
 
 
 def note(text: str) -> None:
-    """A line for people, beside the result."""
+    """A line for people, beside the result: where nobody can take it, the work goes on."""
     if sys.stderr is not None:
-        say(visible(text), sys.stderr)
+        with suppress(OSError):
+            say(visible(text), sys.stderr)
 
 
 def named(out: Path) -> Path:
