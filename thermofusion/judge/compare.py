@@ -258,7 +258,7 @@ def compare_contacts(mesh: ThermalMesh, readings: tuple[SkinReading, ...]) -> Co
         if d.min() > CONTACT_FAR_M:
             raise ScanError(
                 f"the contact reading '{reading.name}' is {d.min() * 100:.0f} cm off the surface",
-                hint="its point is in metres, in the mesh's frame; one of the recording's world needs output.frame=world",
+                hint="its point is in metres, in the mesh's frame; of the recording's world: see --frame",
             )
         under = (d <= max(CONTACT_RADIUS_M, float(d.min()))) & mesh.measured
         map_degC[i] = np.mean(mesh.temperature_degC[under]) if under.any() else np.nan
