@@ -15,6 +15,7 @@ from thermofusion.report import lettering
 from thermofusion.report.casts import MARGIN, VIEWS, cast_views
 from thermofusion.report.lettering import Scale as ColorScale
 from thermofusion.report.pictures import (
+    SHADING,
     cast_mesh,
     difference_scale,
     paint,
@@ -127,13 +128,14 @@ def test_the_world_may_lie_anyhow():
     """The same body in a world with z up and in one of a first camera (y down) gives the same pictures."""
     mesh = result(sphere(40, 60, (0.08, 0.05, 0.1)))
     R = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], float)  # z up, front -y  ->  y down, front -z
+    unturned = {k: v for k, v in mesh.metadata.items() if k not in ("up", "front")}
     turned = replace(
         mesh,
         surface=replace(mesh.surface, vertices_m=(mesh.surface.vertices_m @ R.T).astype(np.float32)),
-        metadata={},
+        metadata=unturned,
     )
     a, b = render_views(mesh, height_px=240), render_views(turned, height_px=240)
-    bare = replace(mesh, metadata={})
+    bare = replace(mesh, metadata=unturned)
     c = render_views(bare, height_px=240, casts=cast_mesh(bare, height_px=240, up=[0, 0, 1], front=[0, -1, 0]))
     for name in (*VIEWS, "overview"):
         assert (np.abs(a[name].astype(int) - b[name]) > 8).mean() < 2e-3, name
@@ -167,19 +169,28 @@ def test_unmeasured_inside_and_outline():
     assert (panel[~cv2.dilate(filled.astype(np.uint8), np.ones((7, 7))).astype(bool)] == 255).all()
 
 
-def test_shading_only_if_asked():
+@pytest.mark.parametrize("name", palettes.PALETTES)
+def test_shading_leaves_a_colour_its_place_on_the_bar(name):
+    """A shaded colour's nearest one on the bar is its own, to a few steps, wherever skin faces the viewer by 45°."""
     mesh = result(sphere(60, 80), unmeasured_below_m=-9)
-    casts = cast_mesh(mesh, height_px=300)
-    flat, shaded = (paint(casts[0], mesh.temperature_degC, replace(INFERNO, shading=s)).astype(int) for s in (0, 0.5))
-    h, w = casts[0].shape
-    assert np.abs(flat - shaded)[h // 2, w // 2].max() <= 1
-    assert shaded[h // 2, w // 2 + int(0.42 * h)].sum() < 0.9 * flat[h // 2, w // 2 + int(0.42 * h)].sum()
+    cast, scale = cast_mesh(mesh, height_px=400)[0], replace(INFERNO, palette=name)
+    flat, shaded = (paint(cast, mesh.temperature_degC, replace(scale, shading=s)).astype(int) for s in (0, SHADING))
+    facing = cast.per_pixel(np.maximum(cast.facing, 0))
+    table = palettes.table(name).astype(int)
+    seen = facing > np.cos(np.radians(45))
+    found, own = (np.abs(p[seen][:, None] - table).sum(axis=2).argmin(axis=1) for p in (shaded, flat))
+    assert seen.sum() > 10_000
+    assert np.abs(found - own).max() <= 10  # of 256
+    assert np.abs(found - own).mean() < 4
+    edge = (facing > 0.2) & (facing < 0.35)
+    assert 0.85 < shaded[edge].sum() / flat[edge].sum() < 0.95  # and yet the shape shows
 
 
 def test_the_bar_says_what_the_colours_mean():
     """The bar's colour at each tick is the palette's at that tick's value, and it stands in every page."""
     image = np.full((400, 200, 3), 255, np.uint8)
-    lettering.color_bar(image, (20, 50, 20, 301), ColorScale("cividis", 30.0, 36.0, "°C", ""), 12, above=True)
+    outside = palettes.Beyond.of(np.array([31.0, 37.5]), 30, 36)
+    lettering.color_bar(image, (20, 50, 20, 301), ColorScale("cividis", 30.0, 36.0, "°C", ""), 12, outside)
     for value in lettering.ticks(30.0, 36.0):
         row = round(50 + (36 - value) / 6 * 300)
         expected = palettes.apply(value, "cividis", 30, 36).astype(int)
@@ -204,25 +215,104 @@ def test_ticks_are_round(lo, hi):
         assert labels == ["26", "28", "30", "32", "34", "36"]
 
 
-def test_degree_sign_is_drawn():
-    image = np.full((40, 200, 3), 255, np.uint8)
-    lettering.write(image, "°", 20, 30, 16)
+@pytest.mark.parametrize(
+    "text", ["°", "Żółć", "Ελένη", "Анна", "أحمد", "שלום", "測試", "😀", "\x1b[31m\n", "\ud800", "x" * 9999]
+)
+def test_any_name_shows_as_letters_or_boxes(text):
+    """Never nothing, never an exception, and cut off at the picture's border."""
+    image = np.full((60, 400, 3), 255, np.uint8)
+    lettering.write(image, text, 20, 40, 16)
     ink = np.nonzero(image[..., 0] < 128)
-    assert 2 <= np.ptp(ink[0]) <= 9  # small,
-    assert ink[0].max() < 24  # high,
-    assert image[ink[0].min() + np.ptp(ink[0]) // 2, round(ink[1].mean()), 0] > 90  # and hollow
+    assert len(ink[0]) > 10
+    assert ink[1].min() >= 18
+    lettering.write(image[:, :10].copy(), text, 3, -2, 16)
+
+
+def test_letters_stand_where_they_are_put():
+    image = np.full((60, 200, 3), 255, np.uint8)
+    lettering.write(image, "H", 20, 40, 16)
+    rows, columns = np.nonzero(image[..., 0] < 128)
+    assert (rows.min(), rows.max()) == pytest.approx((24, 39), abs=1)  # a capital is 16 px high, on its base line
+    assert columns.min() - 20 < 4
+    right = np.full((60, 200, 3), 255, np.uint8)
+    lettering.write(right, "H", 180, 40, 16, align="right")
+    assert 176 <= np.nonzero(right[..., 0] < 128)[1].max() <= 180
     before = image.copy()
     lettering.write(image, "far outside", 900, -50, 16)
     lettering.write(image, "", 20, 30, 16)
     np.testing.assert_array_equal(image, before)
 
 
+def test_the_font_comes_with_its_licence():
+    folder = lettering.FONT.parent
+    assert lettering.FONT.stat().st_size < 800_000
+    assert "Bitstream Vera" in (folder / "LICENSE-DejaVuSans.txt").read_text()
+
+
+def test_what_lies_outside_a_range_is_said():
+    values = np.array([20.0, 29.0, 31.0, 32.0, np.nan])
+    outside = palettes.Beyond.of(values, 30.0, 31.5)
+    assert outside == palettes.Beyond(below=(0.5, 20.0), above=(0.25, 32.0))
+    sentence = palettes.beyond_range(values, 30.0, 31.5)
+    for words in ("30 to 31.5 °C", "50 % of the skin is colder (down to 20.0 °C)", "25 % of the skin is warmer"):
+        assert words in sentence
+    assert palettes.beyond_range(values, 19.0, 33.0) == ""
+    assert palettes.beyond_range(np.full(4, np.nan), 30.0, 31.0) == ""
+    assert [palettes.percent(x) for x in (1e-5, 0.004, 0.094, 0.5)] == ["under 0.1 %", "0.4 %", "9.4 %", "50 %"]
+    # a page whose range leaves out skin differs above the panels, where its warning stands
+    mesh = result()
+    casts = cast_mesh(mesh, height_px=450)
+    quiet, loud = (render_views(mesh, casts=casts, height_px=450, range_degC=x)["overview"] for x in ((0, 60), (0, 1)))
+    alert = (loud[50:64, :300].astype(int) - [*lettering.ALERT]).__abs__().sum(axis=2) < 40
+    assert alert.sum() > 50
+    assert not ((quiet[50:64, :300].astype(int) - [*lettering.ALERT]).__abs__().sum(axis=2) < 40).any()
+
+
+def headings(mesh, monkeypatch):
+    """What is written on the overview, beside numbers of the bar."""
+    said = []
+    draw = lettering.write
+
+    def heard(image, text, *rest, **how):
+        said.append(text)
+        draw(image, text, *rest, **how)
+
+    monkeypatch.setattr(lettering, "write", heard)
+    picture = render_views(mesh, height_px=300)["overview"]
+    return " | ".join(said), picture
+
+
+def test_titles_say_what_is_known(monkeypatch):
+    known = {"scan": "Żółć 17", "room": "room 22.0 °C reflected", "up": "0 0 1", "front": "0 -1 0"}
+    mesh = replace(result(), metadata={**known, "level_sigma_K_reference": 0.08, "level_sigma_K_reflected": 0.06})
+    said, _ = headings(replace(mesh, anchored=True), monkeypatch)
+    for words in ("Skin temperature", "±0.10 K", "Żółć 17", "room 22.0", "median", "R, L"):
+        assert words in said
+    assert "relative" not in said
+    said, _ = headings(replace(mesh, anchored=False), monkeypatch)
+    assert "level is unknown" in said
+    assert "absolute" not in said
+    said, _ = headings(replace(mesh, mode="apparent", anchored=False), monkeypatch)
+    assert "Apparent temperature" in said
+    assert "Skin temperature" not in said
+
+
+def test_geometry_alone_has_no_temperatures_and_no_bar(monkeypatch):
+    """A floor of 6 x 6 m: no title of temperatures, no colour bar, no picture metres wide."""
+    wide = result(replace(sphere(20, 30, (3.0, 3.0, 0.1)), color_rgb=None), unmeasured_below_m=99)
+    said, picture = headings(wide, monkeypatch)
+    assert "emperature" not in said.replace("no temperature was measured", "")
+    assert "600 cm wide" in said
+    assert picture.shape[1] <= 1.1 * 4.2 * 300
+    assert np.ptp(picture[..., :2].astype(int), axis=2).max() < 12  # shape in one light colour, no palette
+
+
 def test_pictures_are_deterministic_and_written(tmp_path):
     mesh = result()
     paths = write_views(mesh, tmp_path / "views", height_px=300)
-    assert {p.stem for p in paths} == {"front", "back", "left", "right", "overview"}
+    assert {p.stem for p in paths} == {*VIEWS, "overview", "uncertainty"}
     pictures = render_views(mesh, height_px=300)
-    for path in paths:
+    for path in paths[:5]:
         np.testing.assert_array_equal(cv2.imread(str(path))[..., ::-1], pictures[path.stem])
     assert len({p.shape[0] for p in pictures.values()}) == 1
     with pytest.raises(ValueError, match="cannot be written"):
@@ -236,10 +326,8 @@ def test_odd_results_are_drawn(mode):
         empty = ThermalMesh.from_temperature(mesh.surface, np.full(len(mesh), np.nan))
         assert render_views(empty, height_px=200)["front"].shape[0] == 200
     elif mode == "relative":
-        assert (
-            render_views(mesh, height_px=300)["front"]
-            != render_views(replace(mesh, anchored=True), height_px=300)["front"]
-        ).any()
+        anchored = render_views(replace(mesh, anchored=True), height_px=300)["front"]
+        assert not np.array_equal(render_views(mesh, height_px=300)["front"], anchored)
     else:
         values = np.where(mesh.measured, mesh.surface.vertices_m[:, 0], np.nan)
         scale = difference_scale(values, "Difference", "K")

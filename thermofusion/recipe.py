@@ -76,7 +76,7 @@ class TrackingSection(_Section):
     refine: bool = Field(False, description="a recorded trajectory is only a start, refined like an estimated one")
     color: bool = Field(True, description="colour helps where a colour camera was recorded")
     fragment_frames: int = Field(8, ge=2, le=1000, description="consecutive frames fused before loop closure")
-    loop_closure: bool = True
+    loop_closure: bool = Field(True, description="places seen again tie the camera's path together")
     refine_to_model: bool = Field(True, description="a last alignment of every frame with the fused model")
     min_fitness: float = Field(0.5, gt=0, le=1, description="share of a frame's points that must find a partner")
     max_residual_mm: float = Field(
@@ -138,7 +138,9 @@ class MappingSection(_Section):
 class EmissivitySection(_Section):
     """ε(θ) of the surface."""
 
-    model: Literal["dielectric", "non-dielectric", "cosine", "water", "tabulated", "fitted", "blackbody"] = "dielectric"
+    model: Literal["dielectric", "non-dielectric", "cosine", "water", "tabulated", "fitted", "blackbody"] = Field(
+        "dielectric", description="how emissivity falls with the angle; skin is a dielectric"
+    )
     n: float | None = Field(
         None,
         gt=1,
@@ -179,7 +181,9 @@ class TemperatureSection(_Section):
     output: Literal["absolute", "normal-equivalent", "apparent"] = Field(
         "absolute", description="what scalar_temperature holds"
     )
-    weight: Literal["inverse-variance", "cos-resolution"] = "inverse-variance"
+    weight: Literal["inverse-variance", "cos-resolution"] = Field(
+        "inverse-variance", description="how views of one spot are averaged: by their errors, or by angle and distance"
+    )
     reflected_degC: float | None = Field(None, ge=-100, le=500, description="overrides the scan's environment")
     air_degC: float | None = Field(None, ge=-100, le=200, description="overrides the scan's environment")
     transmission_per_m: float = Field(
@@ -210,11 +214,14 @@ class OutputSection(_Section):
         "auto",
         description="side of the person that the first depth frame shows; auto: by the feet, else taken for the front",
     )
-
-    formats: list[Literal["ply", "glb", "vtp", "csv"]] = ["ply", "glb", "vtp"]
+    formats: list[Literal["ply", "glb", "vtp", "csv"]] = Field(
+        ["ply", "glb", "vtp"], description="files of the mesh (docs/formats.md)"
+    )
     views: bool = Field(True, description="views/*.png")
     compare_methods: bool = Field(False, description="how every other method's temperatures differ, in result.json")
-    palette: Literal["inferno", "iron", "grey", "cividis", "rainbow"] = "inferno"
+    palette: Literal["inferno", "iron", "grey", "cividis", "rainbow"] = Field(
+        "inferno", description="colours of pictures and meshes; rainbow shows edges that are not in the data"
+    )
     range_degC: tuple[float, float] | None = Field(
         None, strict=False, description="colour range, low and high; None = 1st to 99th percentile"
     )
@@ -230,9 +237,11 @@ class OutputSection(_Section):
 class QualitySection(_Section):
     """The gate: below it the result is written, marked, and the exit code is 4."""
 
-    min_tracked_fraction: float = Field(0.8, ge=0, le=1)
+    min_tracked_fraction: float = Field(0.8, ge=0, le=1, description="share of the depth frames whose pose is known")
     min_coverage: float = Field(0.5, ge=0, le=1, description="share of the surface with a temperature")
-    max_median_sigma_K: float = Field(0.5, gt=0, le=100)
+    max_median_sigma_K: float = Field(
+        0.5, gt=0, le=100, description="median over the skin of a temperature's one sigma"
+    )
     max_voxel_mm: float = Field(15.0, ge=0.5, le=100, description="coarser voxels than asked for, to save memory")
 
 
@@ -252,8 +261,8 @@ RENAMED_STAGES = {"track": "tracking", "fusion": "surface", "align": "rig", "obs
 class Recipe(_Section):
     """The whole tree."""
 
-    name: str = Field("custom", max_length=200)
-    description: str = Field("", max_length=2000)
+    name: str = Field("custom", max_length=200, description="what results call the recipe")
+    description: str = Field("", max_length=2000, description="one line for `thermofusion recipe list`")
     input: InputSection = InputSection()
     subject: SubjectSection = SubjectSection()
     tracking: TrackingSection = TrackingSection()

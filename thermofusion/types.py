@@ -7,13 +7,17 @@ are x right, y down, z forward; the centre of the first pixel is (0, 0). NaN mea
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import IntFlag
 from pathlib import Path
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+    from pyvista import PolyData
 
 Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -22,6 +26,21 @@ Bool = NDArray[np.bool_]
 UInt8 = NDArray[np.uint8]
 
 RIGID_TOLERANCE = 1e-4  # deviation of RᵀR from identity: hand-typed extrinsics carry 5-6 digits
+
+
+def brief(noun: object) -> str:
+    """One line for an object that holds arrays: their shapes instead of their numbers."""
+
+    def shown(value: object) -> str:
+        if isinstance(value, np.ndarray):
+            return f"{value.dtype} {value.shape}"
+        if isinstance(value, tuple | list | dict) and len(value) > 3:
+            return f"{len(value)} of them"
+        text = repr(value)
+        return text if len(text) <= 40 and "\n" not in text else f"<{type(value).__name__}>"
+
+    said = ", ".join(f"{f.name}={shown(getattr(noun, f.name))}" for f in fields(noun))  # type: ignore[arg-type]
+    return f"{type(noun).__name__}({said if len(said) <= 160 else said[:157] + '...'})"
 
 
 def check_rigid(T: object, name: str) -> Float:
@@ -93,6 +112,10 @@ class Camera:
     def is_distorted(self) -> bool:
         return bool(np.any(self.distortion != 0))
 
+    def __repr__(self) -> str:
+        lens = "distorted" if self.is_distorted else "pinhole"
+        return f"<Camera {self.width_px} x {self.height_px} px, focal length {self.focal_px:.1f} px, {lens}>"
+
 
 @dataclass(frozen=True, eq=False)
 class Rig:
@@ -107,6 +130,8 @@ class Rig:
             raise ValueError("the color camera and T_color_depth must be given together")
         if self.T_color_depth is not None:
             object.__setattr__(self, "T_color_depth", check_rigid(self.T_color_depth, "T_color_depth"))
+
+    __repr__ = brief
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +169,8 @@ class ThermalCamera:
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_thermal_depth", check_rigid(self.T_thermal_depth, "T_thermal_depth"))
 
+    __repr__ = brief
+
 
 @dataclass(frozen=True, eq=False)
 class Environment:
@@ -165,6 +192,8 @@ class BlackbodyReference:
     frames: tuple[int, ...]  # `index` of thermal frames
     kind: Literal["blackbody"] = "blackbody"
 
+    __repr__ = brief
+
 
 @dataclass(frozen=True, eq=False)
 class ContactReference:
@@ -174,6 +203,8 @@ class ContactReference:
     uncertainty_K: float
     p_world_m: Float  # (3,)
     kind: Literal["contact"] = "contact"
+
+    __repr__ = brief
 
 
 Reference = BlackbodyReference | ContactReference
@@ -204,8 +235,12 @@ class Stream:
     def __len__(self) -> int:
         return len(self.times_s)
 
+    def __repr__(self) -> str:
+        span_s = float(self.times_s[-1] - self.times_s[0]) if len(self) else 0.0
+        return f"<{type(self).__name__} of {len(self)} frames over {span_s:.2f} s, {int(self.usable.sum())} usable>"
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class ThermalStream(Stream):
     """The thermal camera's images, and the camera that took them."""
 
@@ -241,6 +276,11 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.times_s)
 
+    def __repr__(self) -> str:
+        span_s = float(self.times_s[-1] - self.times_s[0]) if len(self) else 0.0
+        walked_m = float(np.linalg.norm(np.diff(self.T_world_depth[:, :3, 3], axis=0), axis=1).sum())
+        return f"<Trajectory of {len(self)} poses over {span_s:.2f} s, {walked_m:.2f} m long>"
+
 
 @dataclass(frozen=True, eq=False)
 class Scan:
@@ -262,6 +302,11 @@ class Scan:
     subject: dict[str, object] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  # what the reader had to assume, or kept without understanding
 
+    def __repr__(self) -> str:
+        streams = {n: s for n in ("depth", "color", "thermal") if (s := getattr(self, n)) is not None}
+        frames = ", ".join(f"{len(stream)} {name}" for name, stream in streams.items())
+        return f"<Scan {self.name[:40]!r} ({self.format}): {frames} frames, {len(self.references)} references>"
+
 
 @dataclass(frozen=True, eq=False)
 class SurfaceMesh:
@@ -278,6 +323,10 @@ class SurfaceMesh:
 
     def __len__(self) -> int:
         return len(self.vertices_m)
+
+    def __repr__(self) -> str:
+        colored = "" if self.color_rgb is None else ", coloured"
+        return f"<SurfaceMesh of {len(self)} vertices, {len(self.triangles)} triangles{colored}>"
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,6 +356,8 @@ class Observations:
         """The rows of a boolean mask (N,) or an index array (M,)."""
         return Observations(**{k: getattr(self, k)[mask] for k in self.__dataclass_fields__})
 
+    __repr__ = brief
+
 
 @dataclass(frozen=True, eq=False)
 class ThermalViews:
@@ -322,6 +373,26 @@ class ThermalViews:
 
     def __len__(self) -> int:
         return len(self.frame)
+
+    __repr__ = brief
+
+
+@dataclass(frozen=True)
+class SkinPoint:
+    """What a result says of one place: the vertex nearest to it, m; temperature and sigma, °C and K, NaN unmeasured.
+
+    vertex : its index. off_m : how far it lies from the place that was asked for.
+    """
+
+    vertex: int
+    p_world_m: tuple[float, float, float]
+    off_m: float
+    temperature_degC: float
+    uncertainty_K: float
+    apparent_degC: float
+    view_angle_deg: float
+    observations: int
+    flags: VertexFlag
 
 
 class VertexFlag(IntFlag):
@@ -342,12 +413,14 @@ OutputMode = Literal["absolute", "normal-equivalent", "apparent"]
 class ThermalMesh:
     """The result: a surface whose every vertex carries a temperature. All arrays are per vertex, (V,).
 
-    temperature_degC : float32, NaN = unmeasured; in the sense of `mode`. anchored : False = the level is relative (no
-    reference settled it). apparent_degC : as a blackbody camera would read it, mean of the views. uncertainty_K : one
-    sigma of `temperature_degC`. view_angle_deg, distance_m : best (straightest) view's. observations : int32, thermal
-    views that count. flags : uint8, bits of `VertexFlag`; UNMEASURED is set here wherever the temperature is NaN.
-    uncertainty_parts : named parts of the budget, K, float32. metadata : frame, units, recipe, version, and `up` and
-    `front` as "x y z" in the world frame (see `export.axes`). Raises ValueError on lengths or values that cannot be.
+    temperature_degC : float32, NaN = unmeasured; in the sense of `mode`. anchored : False = the level is relative
+    (no reference settled it). apparent_degC : as a blackbody camera would read it, mean of the views. uncertainty_K
+    : one sigma of `temperature_degC`. view_angle_deg, distance_m : best (straightest) view's. observations : int32,
+    thermal views that count. flags : uint8, bits of `VertexFlag`; UNMEASURED is set here wherever the temperature
+    is NaN. uncertainty_parts : named parts of the budget, K, float32. residual : float32, rms of the views about a
+    vertex in sigmas of their own errors (1 = as expected, NaN = one view), or None where that is not known.
+    metadata : frame, units, recipe, version, and `up` and `front` as "x y z" in the world frame (see
+    `export.axes`). Raises ValueError on lengths or values that cannot be.
     """
 
     surface: SurfaceMesh
@@ -362,6 +435,7 @@ class ThermalMesh:
     flags: UInt8
     uncertainty_parts: dict[str, Float32] = field(default_factory=dict)
     metadata: dict[str, str | float] = field(default_factory=dict)
+    residual: Float32 | None = None
 
     def __post_init__(self) -> None:
         if self.mode not in get_args(OutputMode):
@@ -376,6 +450,8 @@ class ThermalMesh:
         object.__setattr__(self, "flags", flags | unmeasured)
         parts = {k: self._column(v, f"uncertainty_parts['{k}']", np.float32) for k, v in self.uncertainty_parts.items()}
         object.__setattr__(self, "uncertainty_parts", parts)
+        if self.residual is not None:
+            object.__setattr__(self, "residual", self._column(self.residual, "residual", np.float32))
 
     def _column(self, values: object, name: str, dtype: DTypeLike) -> NDArray:
         try:
@@ -396,6 +472,62 @@ class ThermalMesh:
     def measured(self) -> Bool:
         """(V,) True where there is a temperature."""
         return ~np.isnan(self.temperature_degC)
+
+    def __repr__(self) -> str:
+        T = self.temperature_degC[self.measured]
+        level = "" if self.mode == "apparent" else ", anchored" if self.anchored else ", relative"
+        spread = f"{np.median(T):.2f} °C median" if len(T) else "no temperature"
+        return f"<ThermalMesh of {len(self)} vertices, {len(T)} measured: {spread}, {self.mode}{level}>"
+
+    def at(self, point_m: ArrayLike) -> SkinPoint:
+        """What is known at the vertex nearest to point_m (3,), in the mesh's world frame, m. Raises ValueError."""
+        p = np.asarray(point_m, np.float64)
+        if p.shape != (3,) or not np.isfinite(p).all() or not len(self):
+            raise ValueError(f"a point on a mesh is three finite coordinates in metres, got {point_m!r}")
+        off_m = np.linalg.norm(self.surface.vertices_m - p, axis=1)
+        i = int(np.argmin(off_m))
+        x, y, z = self.surface.vertices_m[i].tolist()
+        return SkinPoint(
+            vertex=i,
+            p_world_m=(x, y, z),
+            off_m=float(off_m[i]),
+            temperature_degC=float(self.temperature_degC[i]),
+            uncertainty_K=float(self.uncertainty_K[i]),
+            apparent_degC=float(self.apparent_degC[i]),
+            view_angle_deg=float(self.view_angle_deg[i]),
+            observations=int(self.observations[i]),
+            flags=VertexFlag(int(self.flags[i])),
+        )
+
+    def columns(self) -> dict[str, NDArray]:
+        """Name -> one value a vertex, (V,): the columns of docs/formats.md, in the units of their names."""
+        names = ("temperature_degC", "apparent_degC", "uncertainty_K", "view_angle_deg", "distance_m")
+        columns: dict[str, NDArray] = {n: getattr(self, n) for n in (*names, "observations", "flags")}
+        columns |= {} if self.residual is None else {"residual": self.residual}
+        return columns | {f"uncertainty_{part}_K": v for part, v in self.uncertainty_parts.items()}
+
+    def to_dataframe(self) -> DataFrame:
+        """A pandas table, one row a vertex: x_m, y_m, z_m and the columns (V,). Raises ImportError without pandas."""
+        try:
+            from pandas import DataFrame
+        except ImportError as e:
+            raise ImportError(f"to_dataframe needs pandas ({e}): `pip install pandas`") from None
+        place = dict(zip(("x_m", "y_m", "z_m"), self.surface.vertices_m.T, strict=True))
+        return DataFrame({**place, **self.columns()})
+
+    def to_pyvista(self) -> PolyData:
+        """A PyVista surface, points in m, the columns (V,) as point data. Raises ImportError without pyvista."""
+        try:
+            from pyvista import PolyData
+        except ImportError as e:
+            raise ImportError(f"to_pyvista needs PyVista ({e}): `pip install pyvista`") from None
+        triangles = self.surface.triangles
+        faces = np.column_stack([np.full(len(triangles), 3, np.int64), triangles]).ravel()
+        drawn = PolyData(self.surface.vertices_m, faces)
+        for name, values in {"Normals": self.surface.normals, **self.columns()}.items():
+            drawn.point_data[name] = values
+        drawn.set_active_scalars("temperature_degC")
+        return drawn
 
     @classmethod
     def from_temperature(

@@ -199,7 +199,9 @@ def _load(root: Path, config: Mapping[str, Any] | None, board: Board | None) -> 
         tree["board"] = {"kind": board.kind, "columns": board.columns, "rows": board.rows, "spacing_m": board.spacing_m}
     if "board" not in tree:
         raise ScanError(
-            "the board is not described", place=path, hint="write `board`, or give --board on the command line"
+            "the board is not described",
+            place=path,
+            hint='write into it, say, "board": {"kind": "checkerboard", "columns": 9, "rows": 6, "spacing_m": 0.03}',
         )
     return validated(_Config, tree, path)
 

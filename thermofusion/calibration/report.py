@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..report.page import html_page
+from ..report.plot import Area, Axis, Mark, Plot, Points, Rule, page
 from ..types import Float
 from .fit.cameras import INTRINSIC_NAMES, SHIFT, TURN, to_rt
 from .fit.coverage import coverage
 from .fit.rig import Calibration
 from .rig_file import figures
 
-WIDTH, HEIGHT = 420, 300  # px of a plot
+WIDTH = 420  # px, of an embedded picture
 COLORS = {"color": "#1f6feb", "thermal": "#d1242f", "depth": "#1a7f37"}
 STYLE = """.warn{background:#fff8c5;padding:.4rem .8rem;border-left:4px solid #d4a72c}
 figure{display:inline-block;margin:.5rem 1rem .5rem 0;vertical-align:top}figcaption{font-size:.85rem;color:#57606a}
@@ -42,12 +43,9 @@ def report_html(
         _cameras(calibration),
         "<h2>Rig</h2>",
         _extrinsics(calibration),
-        "<h2>Residuals</h2>",
-        *(_residual_scatter(calibration, c) for c in calibration.fit.problem.cameras),
-        _view_bars(calibration, f),
-        _depth_plot(calibration),
-        "<h2>Coverage</h2>",
-        *(_coverage_plot(calibration, c) for c in calibration.single),
+        "<h2>Residuals and coverage</h2>",
+        _plots(calibration, f),
+        _worst_views(f),
         "<h2>What to record next</h2>",
         "<ul>" + "".join(f"<li>{escape(a)}</li>" for a in advice) + "</ul>" if advice else "<p>Nothing is missing.</p>",
         "<h2>Points found</h2>" if pictures else "",
@@ -97,71 +95,64 @@ def _extrinsics(calibration: Calibration) -> str:
     return _table(rows)
 
 
-def _residual_scatter(calibration: Calibration, camera: str) -> str:
+def _plots(calibration: Calibration, f: dict) -> str:
+    """Residuals of every camera, by view and of the depth, and where the board was seen: one sheet of plots."""
+    panels = [_residual_scatter(calibration, c) for c in calibration.fit.problem.cameras]
+    panels.append(_by_view(calibration, f))
+    panels += [] if calibration.fit.problem.depth is None else [_depth_plot(calibration)]
+    panels += [_coverage_plot(calibration, c) for c in calibration.single]
+    return page(panels, columns=2, panel_px=(440.0, 340.0))
+
+
+def _residual_scatter(calibration: Calibration, camera: str) -> Plot:
     e, _ = calibration.fit.residuals()[camera]
     reach = max(float(np.percentile(np.abs(e), 99)), 0.1)
-    x, y = WIDTH / 2 * (1 + e[:, 0] / reach), HEIGHT / 2 * (1 + e[:, 1] / reach)
-    inside = (np.abs(e) <= reach).all(axis=1)
-    dots = "".join(f'<circle cx="{a:.1f}" cy="{b:.1f}" r="1.3"/>' for a, b in zip(x[inside], y[inside], strict=True))
-    axes = f'<path d="M0 {HEIGHT / 2}H{WIDTH}M{WIDTH / 2} 0V{HEIGHT}" stroke="#d0d7de"/>'
-    picture = _svg(axes + f'<g fill="{COLORS[camera]}" fill-opacity=".5">{dots}</g>')
-    return _figure(picture, f"{camera}: projected minus seen; the frame is ±{reach:.2f} px")
+    x, y = Axis.spanning("right, px", -reach, reach), Axis.spanning("down, px", -reach, reach)
+    inside = e[(np.abs(e) <= reach).all(axis=1)]
+    marks: list[Mark] = [Rule(0.0, "x"), Rule(0.0), Points(inside[:, 0], inside[:, 1], COLORS[camera], radius=1.2)]
+    return Plot(f"{camera}: projected minus seen", x, y, marks)
 
 
-def _view_bars(calibration: Calibration, f: dict) -> str:
-    views = f["views_rms_px"]
-    top = max((v for row in views.values() for v in row.values()), default=1.0)
-    step, parts = WIDTH * 2 / max(len(views), 1), []
-    cameras = calibration.fit.problem.cameras
-    for i, (name, row) in enumerate(views.items()):
-        for k, c in enumerate(cameras):
-            if c not in row:
-                continue
-            h = 0.85 * HEIGHT * row[c] / top
-            w = 0.8 * step / len(cameras)
-            title = f"<title>{escape(name)}, {c}: {row[c]:.2f} px</title>"
-            parts.append(
-                f'<rect x="{i * step + k * w:.1f}" y="{HEIGHT - h:.1f}" width="{w:.1f}" height="{h:.1f}" '
-                f'fill="{COLORS[c]}">{title}</rect>'
-            )
-    return _figure(_svg("".join(parts), WIDTH * 2), f"rms by view in order of recording; the highest is {top:.2f} px")
+def _by_view(calibration: Calibration, f: dict) -> Plot:
+    views = list(f["views_rms_px"].items())
+    top = max((v for _, row in views for v in row.values()), default=1.0)
+    marks: list[Mark] = []
+    for c in calibration.fit.problem.cameras:
+        at = [i for i, (_, row) in enumerate(views, 1) if c in row]
+        marks.append(Points(at, [views[i - 1][1][c] for i in at], COLORS[c], c))
+    x = Axis.spanning("view, in order of recording", 0, len(views) + 1)
+    return Plot("rms by view", x, Axis.spanning("px", 0, 1.1 * top), marks)
 
 
-def _depth_plot(calibration: Calibration) -> str:
+def _worst_views(f: dict) -> str:
+    rms = [(v, name, c) for name, row in f["views_rms_px"].items() for c, v in row.items()]
+    worst = ", ".join(f"{escape(name)} ({c}, {v:.2f} px)" for v, name, c in sorted(rms, reverse=True)[:3])
+    return f"<p>Largest rms of a view: {worst}.</p>" if worst else ""
+
+
+def _depth_plot(calibration: Calibration) -> Plot:
     problem = calibration.fit.problem
-    if problem.depth is None:
-        return ""
+    assert problem.depth is not None
     r, _ = calibration.fit.residuals()["depth_plane"]
-    d, mm = problem.depth, r * problem.depth.sigma * 1e3
+    value, mm = problem.depth.value, r * problem.depth.sigma * 1e3
     reach = max(float(np.percentile(np.abs(mm), 99)), 1e-3)
-    lo, hi = float(d.value.min()), float(d.value.max())
-    x = WIDTH * (d.value - lo) / max(hi - lo, 1e-9)
-    y = HEIGHT / 2 * (1 + mm / reach)
-    step = max(1, len(x) // 3000)
-    dots = "".join(f'<circle cx="{a:.1f}" cy="{b:.1f}" r="1.2"/>' for a, b in zip(x[::step], y[::step], strict=True))
-    axis = f'<path d="M0 {HEIGHT / 2}H{WIDTH}" stroke="#d0d7de"/>'
-    picture = _svg(axis + f'<g fill="{COLORS["depth"]}" fill-opacity=".4">{dots}</g>')
-    return _figure(picture, f"depth minus board plane, ±{reach:.1f} mm, against reported value {lo:.2f} to {hi:.2f}")
+    pick = slice(None, None, max(1, len(value) // 3000))
+    x = Axis.spanning("reported value", float(value.min()), max(float(value.max()), float(value.min()) + 1e-6))
+    marks: list[Mark] = [Rule(0.0), Points(value[pick], mm[pick], COLORS["depth"], radius=1.2)]
+    return Plot("depth minus board plane", x, Axis.spanning("mm", -reach, reach), marks)
 
 
-def _coverage_plot(calibration: Calibration, camera: str) -> str:
+def _coverage_plot(calibration: Calibration, camera: str) -> Plot:
+    """Where the board was seen; thirds of the picture in which it never was are tinted."""
     w, h = calibration.fit.problem.sizes[camera]
     px = np.concatenate([v.points[camera].px for v in calibration.data.seen_by(camera)])
-    scale = WIDTH / w
-    counts = coverage(calibration, camera).counts
-    dots = "".join(f'<circle cx="{u * scale:.1f}" cy="{v * scale:.1f}" r="1.2"/>' for u, v in px)
-    height = h * scale
-    lines = "".join(
-        f'<path d="M{WIDTH * k / 3:.1f} 0V{height:.1f}M0 {height * k / 3:.1f}H{WIDTH}" stroke="#d0d7de"/>'
-        for k in (1, 2)
-    )
-    empty = "".join(
-        f'<rect x="{WIDTH * i / 3:.1f}" y="{height * j / 3:.1f}" width="{WIDTH / 3:.1f}" height="{height / 3:.1f}" '
-        'fill="#ffebe9"/>'
-        for j, i in np.argwhere(counts == 0)
-    )
-    picture = _svg(empty + lines + f'<g fill="{COLORS[camera]}" fill-opacity=".5">{dots}</g>', WIDTH, height)
-    return _figure(picture, f"{camera}: where the board was seen; red parts never")
+    marks: list[Mark] = [
+        Area([w * i / 3, w * (i + 1) / 3], [h * (2 - j) / 3] * 2, [h * (3 - j) / 3] * 2, "#d1242f", opacity=0.15)
+        for j, i in np.argwhere(coverage(calibration, camera).counts == 0)
+    ]
+    marks.append(Points(px[:, 0], h - px[:, 1], COLORS[camera], radius=1.2))
+    x, y = Axis.spanning("px from the left", 0, w), Axis.spanning("px from the bottom", 0, h)
+    return Plot(f"{camera}: where the board was seen", x, y, marks)
 
 
 def _picture(caption: str, image: NDArray[np.uint8]) -> str:
@@ -180,10 +171,6 @@ def _table(rows: list[list[str]]) -> str:
 
 def _figure(content: str, caption: str) -> str:
     return f"<figure>{content}<figcaption>{escape(caption)}</figcaption></figure>"
-
-
-def _svg(content: str, width: float = WIDTH, height: float = HEIGHT) -> str:
-    return f'<svg width="{width:.0f}" height="{height:.0f}" viewBox="0 0 {width:.0f} {height:.0f}">{content}</svg>'
 
 
 def _list(values: Float, digits: int) -> str:

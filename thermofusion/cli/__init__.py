@@ -20,13 +20,11 @@ import typer
 from ..errors import INTERRUPTED, INTERRUPTED_SENTENCE, ThermofusionError
 from ..version import __version__
 from . import calibrate, inspect, judge, paper, process, recordings, thermal
-from .console import READER_GONE, fail, leave
+from .console import READER_GONE, fail, help_alone, leave
 
 app = typer.Typer(
     name="thermofusion",
     help="3D models whose every point carries its true skin temperature, from a depth camera and a thermal camera.",
-    no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
@@ -34,13 +32,15 @@ for group in (process, inspect, recordings, judge, calibrate, thermal, paper):
     group.register(app)
 
 
-@app.callback()
+@app.callback(invoke_without_command=True)
 def _root(
+    context: typer.Context,
     version: bool = typer.Option(False, "--version", help="Print the version and exit.", is_eager=True),
 ) -> None:
     if version:
         print(f"thermofusion {__version__}")
         raise typer.Exit
+    help_alone(context)
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -94,13 +94,16 @@ def board(
     json: Json = False,
 ) -> None:
     """A board to print at 100 %, with a scale bar to check the printer."""
-    from ..calibration import Board, board_pdf, board_svg
+    from ..calibration import Board
+    from ..calibration.board.print import draw_board, paper_of
     from ..files.whole import replacing
 
     target = Board(kind, columns, rows, spacing_mm / 1e3)  # type: ignore[arg-type]
     if out.suffix not in (".svg", ".pdf"):
         raise RecipeError(f"a board is written as .svg or .pdf, not '{out.suffix}'", place=out)
-    data = board_pdf(target) if out.suffix == ".pdf" else board_svg(target).encode()
+    page = draw_board(target)
+    data, paper = page.pdf() if out.suffix == ".pdf" else page.svg().encode(), paper_of(page)
     with replacing(out) as temporary:
         temporary.write_bytes(data)
-    emit({"board": out, "kind": kind}, f"wrote {out}; print it at 100 % and measure the scale bar", json)
+    text = f"wrote {out} for {paper}; print it at 100 %, not fitted to the page, and measure the scale bar"
+    emit({"board": out, "kind": kind, "paper": paper}, text, json)

@@ -11,6 +11,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NoReturn, TextIO
 
+import typer
+
 from ..errors import RecipeError, visible
 from ..files.json import to_json
 from ..progress import Progress
@@ -88,6 +90,13 @@ def low_high(text: str | None, unit: str) -> tuple[float, float] | None:
     if not low < high:
         raise RecipeError(f"--range needs low < high, got '{text}'")
     return low, high
+
+
+def help_alone(context: typer.Context) -> None:
+    """A group of verbs that is called without one prints its help; that is no error."""
+    if context.invoked_subcommand is None:
+        print(context.get_help())
+        raise typer.Exit
 
 
 @contextmanager

@@ -23,7 +23,16 @@ KNOWN_DEVICES = {
     (0x289D, 0x0010): "Seek Compact",
     (0x289D, 0x0011): "Seek Compact Pro",
 }
-PACKAGES = ("open3d", "numpy", "scipy", "opencv-contrib-python-headless", "pyusb", "libusb-package", "pydantic")
+PACKAGES = (
+    "open3d",
+    "numpy",
+    "scipy",
+    "opencv-contrib-python-headless",
+    "pillow",
+    "pyusb",
+    "libusb-package",
+    "pydantic",
+)
 MIN_MEMORY_GIB = 4.0
 
 
@@ -47,6 +56,8 @@ def _python() -> Examined:
 
 
 def _libc() -> Examined:
+    if platform.system() != "Linux":
+        return Examined("libc", "ok", f"{platform.system()}: wheels bring their own; not tested here by the developers")
     name, version = platform.libc_ver()
     return Examined(
         "libc", "ok" if name else "warning", f"{name} {version}" if name else "not glibc: wheels may not fit"
@@ -76,8 +87,8 @@ def _open3d() -> Examined:
 def _memory() -> Examined:
     try:
         gib = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    except (ValueError, OSError):
-        return Examined("memory", "warning", "unknown")
+    except (AttributeError, ValueError, OSError):  # Windows has no sysconf, macOS not every name
+        return Examined("memory", "ok", f"size unknown on this system, {os.cpu_count()} cores; 4 GiB are wanted")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return Examined("memory", "ok" if gib >= MIN_MEMORY_GIB else "warning", f"{gib:.1f} GiB, {cores} cores")
 

@@ -7,10 +7,12 @@ from typing import Annotated
 
 import typer
 
-from .console import emit, note
+from .console import emit, help_alone, note
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
-recipes = typer.Typer(help="The processing recipes: list, show, validate, keys.", no_args_is_help=True)
+recipes = typer.Typer(
+    help="The processing recipes: list, show, validate, keys.", invoke_without_command=True, callback=help_alone
+)
 
 
 def register(app: typer.Typer) -> None:
@@ -59,11 +61,16 @@ def check(
 
 @recipes.command("list")
 def recipe_list(json: Json = False) -> None:
-    """The shipped recipes."""
+    """The shipped recipes, and the scenes of `simulate`."""
+    from ..phantom import load_scene, shipped_scenes
     from ..recipe import load_recipe, shipped_recipes
 
     found = {name: load_recipe(name).description for name in shipped_recipes()}
-    emit(found, "\n".join(f"{name:<18} {text}" for name, text in found.items()), json)
+    scenes = {name: load_scene(name).description for name in shipped_scenes()}
+    lines = [f"{name:<18} {text}" for name, text in found.items()]
+    lines += ["", "scenes, for `thermofusion simulate SCENE -o SCAN`:"]
+    lines += [f"{name:<18} {text}".rstrip() for name, text in scenes.items()]
+    emit({"recipes": found, "scenes": scenes}, "\n".join(lines), json)
 
 
 @recipes.command("show")

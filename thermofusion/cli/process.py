@@ -12,6 +12,7 @@ from .console import emit, low_high, named, note, progress
 from .options import Json, Processing, Recording, spelled_out
 
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what stands in the result folder.")]
+STAGES = "tracking, surface, rig, mapping, temperature"  # pipeline.STAGE_NAMES, which --help has no time to load
 
 
 def register(app: typer.Typer) -> None:
@@ -25,8 +26,8 @@ def run(
     recording: Recording,
     processing: Processing,
     out: Annotated[Path, typer.Option("-o", "--out", help="Result folder.")] = Path("out"),
-    from_: Annotated[str | None, typer.Option("--from", help="Compute this stage and all later ones anew.")] = None,
-    until: Annotated[str | None, typer.Option("--until", help="Stop after this stage.")] = None,
+    from_: Annotated[str | None, typer.Option("--from", help=f"Compute anew from this stage: {STAGES}.")] = None,
+    until: Annotated[str | None, typer.Option("--until", help=f"Stop after this stage: {STAGES}.")] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be computed, and why.")] = False,
     overwrite: Overwrite = False,
     json: Json = False,
@@ -75,19 +76,26 @@ def export(
     palette: Annotated[str, typer.Option(help="inferno, iron, grey, cividis, rainbow.")] = "inferno",
     range_: Annotated[str | None, typer.Option("--range", help="Colour range in °C, low:high.")] = None,
     show: Annotated[str, typer.Option(help="absolute, normal-equivalent or apparent.")] = "absolute",
+    size: Annotated[int, typer.Option("--size", min=300, max=6000, help="Height of the pictures, px.")] = 900,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder; the result's own by default.")] = None,
     json: Json = False,
 ) -> None:
-    """Write a result's mesh again: other formats, palette, range, or output mode."""
+    """Write a result's mesh and pictures again: other formats, palette, range, size, or output mode."""
     from .. import pipeline
     from ..export import export as write
+    from ..export.palettes import beyond_range
+    from ..report.pictures import write_views
 
     limits = low_high(range_, "°C")
     mesh = pipeline.load_mesh(result, show)
     folder = result if out is None else named(out)
-    name = "mesh" if show == "absolute" else f"mesh-{show}"  # other modes never replace the corrected mesh
+    mode = "" if show == "absolute" else f"-{show}"  # other modes never replace the corrected mesh and its pictures
     wanted = tuple(f.strip() for f in formats.split(","))
-    written = write(mesh, folder, wanted, palette=palette, range_degC=limits, name=name)
+    written = write(mesh, folder, wanted, palette=palette, range_degC=limits, name=f"mesh{mode}")
+    written += write_views(mesh, folder / f"views{mode}", palette=palette, range_degC=limits, height_px=size)
     if folder.resolve() == result.resolve():
         pipeline.add_files(result, written)
+    outside = "" if limits is None else beyond_range(mesh.temperature_degC, *limits)
+    if outside:
+        note(f"note: {outside}")
     emit({"written": written}, "\n".join(f"wrote {path}" for path in written), json)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from ..errors import RecipeError
-from .console import emit
+from .console import emit, progress
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Force = Annotated[bool, typer.Option("--overwrite", help="Replace an existing scan folder.")]
@@ -36,12 +37,16 @@ def import_(
 
     scan = open_scan(recording, format=format)
     if thermal is not None and rig is None:
-        raise RecipeError("--thermal needs --rig: where the thermal camera sits", hint="see `thermofusion calibrate`")
+        raise RecipeError(
+            "--thermal needs --rig: where the thermal camera sits",
+            hint="`thermofusion calibrate PICTURES -o rig.json` writes one",
+        )
     if thermal is not None and rig is not None:
         scan = with_thermal(scan, read_thermal_frames(thermal), rig)
     elif rig is not None:
         scan = with_rig(scan, rig)
-    write_scan(scan, out, overwrite=overwrite)
+    with progress(json) as step:
+        write_scan(scan, out, overwrite=overwrite, progress=step)
     streams = {name: len(s) for name in ("depth", "color", "thermal") if (s := getattr(scan, name)) is not None}
     counts = ", ".join(f"{n} {name}" for name, n in streams.items())
     emit(
@@ -52,7 +57,9 @@ def import_(
 
 
 def simulate(
-    scene: Annotated[str, typer.Argument(help="A shipped scene's name or a TOML file.")],
+    scene: Annotated[
+        str, typer.Argument(help="A shipped scene (`thermofusion recipe list` names them) or a TOML file.")
+    ],
     out: Annotated[Path, typer.Option("-o", "--out", help="Scan folder to write.")],
     seed: Annotated[int, typer.Option(help="Of the noise; same seed, same scan.")] = 0,
     overwrite: Force = False,
@@ -62,5 +69,7 @@ def simulate(
     from ..phantom import load_scene
     from ..phantom import simulate as record
 
-    folder = record(load_scene(scene), out, seed=seed, overwrite=overwrite)
+    with progress(json) as step:
+        frames = partial(step, "frames")
+        folder = record(load_scene(scene), out, seed=seed, overwrite=overwrite, progress=frames)
     emit({"scan": folder, "seed": seed}, f"wrote {folder}", json)

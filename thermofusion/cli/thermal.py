@@ -12,7 +12,7 @@ import typer
 
 from ..errors import RecipeError, ScanError
 from ..progress import Progress
-from .console import emit, low_high, note, progress
+from .console import emit, help_alone, low_high, note, progress
 from .options import spelled_out
 
 if TYPE_CHECKING:
@@ -34,7 +34,9 @@ FIELD_MARGIN = 0.1  # of the curve's range: vignetting and noise about a source 
 STILL_SHARE = 0.02  # of a picture may move in a still recording
 
 verbs = typer.Typer(
-    help="The thermal camera by itself: curve, field, flatten, noise, edge, time-offset.", no_args_is_help=True
+    help="The thermal camera by itself: curve, field, flatten, noise, edge, time-offset.",
+    invoke_without_command=True,
+    callback=help_alone,
 )
 
 

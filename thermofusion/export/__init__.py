@@ -97,6 +97,8 @@ def showing(mesh: ThermalMesh, mode: OutputMode) -> ThermalMesh:
     if mode == mesh.mode:
         return mesh
     if mode != "apparent":
-        raise RecipeError(f"the result holds {mesh.mode} temperatures, not {mode}", hint=f"run with output '{mode}'")
+        raise RecipeError(
+            f"the result holds {mesh.mode} temperatures, not {mode}", hint=f"run with --set temperature.output={mode}"
+        )
     unknown = np.full(len(mesh), np.nan, np.float32)
     return replace(mesh, temperature_degC=mesh.apparent_degC, mode=mode, uncertainty_K=unknown, uncertainty_parts={})

@@ -8,6 +8,7 @@ is the instrument makers' habit. `rainbow` invents edges where there are none (B
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
 from typing import Literal, get_args
 
@@ -34,6 +35,7 @@ PALETTES: tuple[str, ...] = get_args(PaletteName)  # what a recipe may name
 WARNINGS = {"rainbow": "the rainbow palette shows edges that are not in the data; use it only to match older pictures"}
 UNMEASURED_RGB = (168, 168, 168)  # sRGB: a grey that no coloured palette holds
 UNMEASURED_ON_GREY_RGB = (96, 128, 176)  # the grey and cividis palettes pass through grey: unmeasured skin is bluish
+MUCH_BEYOND = 0.05  # share of the skin outside a chosen range that is worth a sentence: 2 % are outside by default
 DEFAULT_RANGE_DEGC = (20.0, 40.0)  # where nothing is measured
 
 
@@ -90,6 +92,38 @@ def color_range(
         lo, hi = -max(abs(lo), abs(hi)), max(abs(lo), abs(hi))
     lo, hi = np.floor(lo / step) * step, np.ceil(hi / step) * step
     return (float(lo), float(hi)) if lo < hi else (float(lo - step), float(hi + step))
+
+
+@dataclass(frozen=True)
+class Beyond:
+    """What lies outside a range: below and above it, each (share of the values there are, the farthest value)."""
+
+    below: tuple[float, float] = (0.0, 0.0)
+    above: tuple[float, float] = (0.0, 0.0)
+
+    @classmethod
+    def of(cls, values: NDArray, lo: float, hi: float) -> Beyond:
+        """Of values of any shape and the range lo to hi, in their unit; NaN does not count."""
+        finite = values[np.isfinite(values)]
+        if not len(finite):
+            return cls()
+        below, above = float((finite < lo).mean()), float((finite > hi).mean())
+        return cls((below, float(finite.min())), (above, float(finite.max())))
+
+
+def percent(share: float) -> str:
+    """A share in percent, never rounded to nothing."""
+    return "under 0.1 %" if share < 5e-4 else f"{100 * share:.1f} %" if share < 0.095 else f"{100 * share:.0f} %"
+
+
+def beyond_range(values: NDArray, lo: float, hi: float) -> str:
+    """What of temperatures (any shape, °C) a chosen colour range does not show, in a clause; empty: hardly anything."""
+    beyond = Beyond.of(values, lo, hi)
+    if beyond.below[0] + beyond.above[0] < MUCH_BEYOND:
+        return ""
+    sides = ((beyond.below, "colder", "down"), (beyond.above, "warmer", "up"))
+    said = [f"{percent(x)} of the skin is {side} ({way} to {end:.1f} °C)" for (x, end), side, way in sides if x > 0]
+    return f"the colours run from {lo:g} to {hi:g} °C, but {' and '.join(said)}"
 
 
 def srgb_to_linear(srgb: UInt8) -> NDArray[np.float32]:

@@ -27,7 +27,7 @@ from .contacts import SkinReading, read_contacts
 from .register import Registration, as_they_are, mirrored, register
 
 if TYPE_CHECKING:
-    from ..report.plot import Axis, Mark
+    from ..report.plot import Mark
 
 TRUTH_ARRAYS = ("vertices_m", "triangles", "temperature_degC")
 MAX_DISTANCE_M = 0.010  # between partners on the two surfaces
@@ -290,14 +290,14 @@ PLOT_POINTS = 1500  # a plot of more dots is a cloud
 
 def bland_altman_svg(comparison: Comparison) -> str:
     """Differences over means with bias and limits of agreement, as an SVG document."""
-    from ..report.plot import BLUE, DASHED, ORANGE, Plot, Points, Rule, page
+    from ..report.plot import BLUE, DASHED, ORANGE, Axis, Plot, Points, Rule, page
 
     c, a = comparison, comparison.agreement
     pick = slice(None, None, max(1, len(c.first_degC) // PLOT_POINTS))
     mean, d = (c.first_degC[pick] + c.second_degC[pick]) / 2, (c.first_degC - c.second_degC)[pick]
     reach = max(float(np.percentile(np.abs(d), 99.5)), abs(a.lower_K), abs(a.upper_K)) * 1.15 + 1e-3
-    x = _axis("mean of both, °C", float(mean.min()) - 0.1, float(mean.max()) + 0.1)
-    y = _axis("first minus second, K", -reach, reach)
+    x = Axis.spanning("mean of both, °C", float(mean.min()) - 0.1, float(mean.max()) + 0.1)
+    y = Axis.spanning("first minus second, K", -reach, reach)
     marks: list[Mark] = [
         Points(mean, d, BLUE, radius=1.4 if len(d) > 100 else 3.0),
         Rule(a.bias_K, color=ORANGE, dash=""),
@@ -306,14 +306,6 @@ def bland_altman_svg(comparison: Comparison) -> str:
     ]
     caption = f"bias {a.bias_K:+.3f} K, 95 % limits of agreement {a.lower_K:+.3f} to {a.upper_K:+.3f} K; {a.n} values"
     return page([Plot("Bland-Altman", x, y, marks)], caption=caption, columns=1, panel_px=(640.0, 420.0))
-
-
-def _axis(label: str, lo: float, hi: float) -> Axis:
-    from ..report.plot import Axis
-
-    span = hi - lo
-    step = next(s for s in (1e-3, 2e-3, 5e-3, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50) if span / s <= 9)
-    return Axis(label, lo, hi, step)
 
 
 def write_comparison(comparison: Comparison, folder: Path) -> list[Path]:

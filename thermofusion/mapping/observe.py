@@ -34,6 +34,7 @@ from ..types import (
     ThermalStream,
     ThermalViews,
     Trajectory,
+    brief,
 )
 from .motion import MotionResult, view_corrections
 from .references import BlackbodyReading, read_blackbodies
@@ -94,6 +95,8 @@ class Mapped:
     blackbodies: tuple[BlackbodyReading, ...]
     motion: MotionResult | None = None
 
+    __repr__ = brief
+
 
 def observe(
     scan: Scan,
@@ -145,7 +148,7 @@ def observe_views(
     if not sum(len(p) for p in parts):
         raise ScanError(
             "no thermal view sees the surface",
-            hint="check T_thermal_depth and the thermal clock with `thermofusion check`",
+            hint="check T_thermal_depth and the thermal clock with `thermofusion check SCAN`",
         )
     return Observations(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in columns})
 

@@ -15,8 +15,10 @@ from ..geometry.rays import RayScene, barycentric
 from ..types import Float, Float32, Int, SurfaceMesh
 
 VIEWS = ("front", "back", "left", "right")
+DOUBTS = ("uncertainty", "residual")  # maps that are drawn beside the temperature's, on one page each
 RAYS = 2  # per pixel, along each side
 MARGIN = 0.02  # of the picture's height, round the surface
+MAX_ASPECT = 4.2  # width over height of all views side by side: four of a ball fit, and a floor stays small
 # Of each view: the picture's right and the direction to the viewer, as (axis, sign) of (right, up, front). "left" is
 # the left side of somebody who faces the viewer of "front".
 _DIRECTIONS = {
@@ -68,9 +70,8 @@ def cast_views(
     height_px: int,
     *,
     views: tuple[str, ...] = VIEWS,
-    max_width_px: int | None = None,
 ) -> list[Cast]:
-    """Cast views of one scale, `height_px` high and as wide as the surface, which is at most `max_width_px`.
+    """Cast views of one scale, `height_px` high and together at most MAX_ASPECT times as wide.
 
     axes : (3, 3), rows right, up and front in the world frame (`export.axes_of`). Raises ValueError for a surface
     without triangles.
@@ -83,9 +84,9 @@ def cast_views(
     lo, hi = local[used].min(axis=0), local[used].max(axis=0)
     half = (hi - lo) / 2
     frame_px = 2 * MARGIN * height_px
-    widest = max(2 * half[_DIRECTIONS[name][0][0]] for name in views)
-    room_px = (max_width_px or 2 * height_px) - frame_px
-    scale = float(min((height_px - frame_px) / max(2 * half[1], 1e-6), room_px / max(widest, 1e-6)))
+    width_m = sum(2 * half[_DIRECTIONS[name][0][0]] for name in views)
+    room_px = MAX_ASPECT * height_px - len(views) * frame_px
+    scale = float(min((height_px - frame_px) / max(2 * half[1], 1e-6), room_px / max(width_m, 1e-6)))
     scene = RayScene(local - (lo + hi) / 2, surface.triangles)
     with ThreadPoolExecutor(max_workers=2) as pool:
         return list(pool.map(lambda name: _cast(scene, surface.triangles, name, half, scale, height_px), views))

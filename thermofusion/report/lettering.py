@@ -1,26 +1,30 @@
-"""Letters, ticks and the colour bar of the pictures, drawn with OpenCV's own fonts on RGB arrays, in place.
+"""Letters, ticks and the colour bar of the pictures, on RGB arrays, in place.
 
-OpenCV's Hershey fonts know ASCII only: the degree sign is drawn as a small circle, any other letter becomes `?`.
+One font comes with the package (DejaVu Sans: Latin, Greek, Cyrillic, Arabic, Hebrew and more). A letter that it does
+not have, Chinese say, becomes a box.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
+from pathlib import Path
 from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
 
-from ..export.palettes import table
+from ..export.palettes import Beyond, percent, table
 from ..types import UInt8
 
-INK, QUIET = (34, 34, 38), (110, 110, 116)  # sRGB of letters and lines, and of what stands back
-FONT = cv2.FONT_HERSHEY_SIMPLEX
-_FINE = 4  # letters are drawn this much larger, then averaged down: smooth at any size
-_STROKES = cv2.__version__.startswith("4")  # OpenCV 4 draws letters with a pen; from 5 on they are outlines
+INK, QUIET, ALERT = (34, 34, 38), (96, 96, 102), (176, 58, 0)  # sRGB of letters; of what stands back; of a warning
+FONT = Path(__file__).parent / "fonts" / "DejaVuSans.ttf"
+CAPITAL = 1493 / 2048  # height of a capital over the font's size
+LEFT_TO_RIGHT = "\N{LEFT-TO-RIGHT MARK}"  # behind a name in Arabic or Hebrew: what follows stays where it is
+LONGEST = 400  # letters of a line; what is longer ends in dots
 
 
 @dataclass(frozen=True)
@@ -62,37 +66,20 @@ def text_width(text: str, size_px: float) -> int:
     return _letters(text, size_px).shape[1] - 2 * round(size_px)
 
 
-@cache
-def _capital() -> float:
-    """Height of a capital at scale 1, px; getTextSize gives a line's height in OpenCV 5."""
-    canvas = np.zeros((400, 400), np.uint8)
-    cv2.putText(canvas, "H", (20, 300), FONT, 8.0, 255, 1, cv2.LINE_AA)
-    return float(np.count_nonzero(canvas.max(axis=1) > 127)) / 8
+@lru_cache(maxsize=32)
+def _font(size_px: float) -> ImageFont.FreeTypeFont:
+    return ImageFont.truetype(str(FONT), size_px / CAPITAL)
 
 
 def _letters(text: str, size_px: float) -> NDArray[np.float32]:
     """Coverage 0..1 of the text, with a margin of `size_px` on every side."""
-    big = size_px * _FINE
-    scale, pad, pen = big / _capital(), round(size_px) * _FINE, max(round(big / 8.5), 1)
-    thick = pen if _STROKES else 1
-    degree, gap = round(big * 0.17), round(big * 0.1)
-    runs = [run.encode("ascii", "replace").decode() for run in text.split("°")]
-    widths = [cv2.getTextSize(run, FONT, scale, thick)[0][0] if run else 0 for run in runs]
-    total = sum(widths) + (len(runs) - 1) * (2 * degree + 2 * gap)
-    h = math.ceil((big + 2 * pad) / _FINE) * _FINE
-    w = math.ceil((total + 2 * pad) / _FINE) * _FINE
-    canvas = np.zeros((h, w), np.uint8)
-    x, base = pad, h - pad
-    for number, (run, width) in enumerate(zip(runs, widths, strict=True)):
-        if number:
-            cv2.circle(
-                canvas, (x + gap + degree, base - round(big) + degree), degree, 255, pen * 3 // 4 + 1, cv2.LINE_AA
-            )
-            x += 2 * degree + 2 * gap
-        cv2.putText(canvas, run, (x, base), FONT, scale, 255, thick, cv2.LINE_AA)
-        x += width
-    coverage = cv2.resize(canvas, (w // _FINE, h // _FINE), interpolation=cv2.INTER_AREA)
-    return coverage.astype(np.float32) / np.float32(255)
+    text = text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"
+    text = "".join(c if c.isprintable() or c == LEFT_TO_RIGHT else "\N{REPLACEMENT CHARACTER}" for c in text)
+    font, pad = _font(size_px), round(size_px)
+    w, h = math.ceil(font.getlength(text)) + 2 * pad, math.ceil(size_px) + 2 * pad
+    canvas = Image.new("L", (w, h))
+    ImageDraw.Draw(canvas).text((pad, h - pad), text, fill=255, font=font, anchor="ls")
+    return np.asarray(canvas, np.float32) / np.float32(255)
 
 
 def ticks(lo: float, hi: float, wanted: int = 6) -> list[float]:
@@ -110,31 +97,35 @@ def tick_label(value: float, marks: list[float]) -> str:
 
 
 def color_bar(
-    image: UInt8,
-    box: tuple[int, int, int, int],
-    scale: Scale,
-    size_px: float,
-    *,
-    below: bool = False,
-    above: bool = False,
+    image: UInt8, box: tuple[int, int, int, int], scale: Scale, size_px: float, beyond: Beyond | None = None
 ) -> None:
     """A vertical bar in `box` = (x, y, width, height), low at the bottom, ticks and the unit at its right.
 
-    below, above : a point at that end tells that values beyond the range are shown in its last colour.
+    beyond : what lies outside the range. A point at that end tells that it is shown in the last colour, and beside it
+    stands how much that is and how far it reaches.
     """
     (x, y, w, h), lo, hi = box, scale.lo, scale.hi
     rows = np.round(np.linspace(255, 0, h)).astype(np.uint8)
     image[y : y + h, x : x + w] = table(scale.palette)[rows][:, None]
-    line = max(round(size_px / 12), 1)
+    line, right, tip_px = max(round(size_px / 12), 1), x + w + size_px * 0.9, round(w * 0.7)
     cv2.rectangle(image, (x - 1, y - 1), (x + w, y + h), INK, line, cv2.LINE_AA)
-    for at_end, end, sign, index in ((above, y - 1, -1, 255), (below, y + h, 1, 0)):
-        if at_end:
-            tip = np.array([[x - 1, end], [x + w, end], [x + (w - 1) // 2, end + sign * round(w * 0.7)]], np.int32)
-            cv2.fillPoly(image, [tip], table(scale.palette)[index].tolist(), cv2.LINE_AA)
-            cv2.polylines(image, [tip], True, INK, line, cv2.LINE_AA)
+    top = y
+    for above in (False, True):
+        share, reach = (0.0, 0.0) if beyond is None else beyond.above if above else beyond.below
+        if share == 0:
+            continue
+        end, sign = (y - 1, -1) if above else (y + h, 1)
+        tip = np.array([[x - 1, end], [x + w, end], [x + (w - 1) // 2, end + sign * tip_px]], np.int32)
+        cv2.fillPoly(image, [tip], table(scale.palette)[255 if above else 0].tolist(), cv2.LINE_AA)
+        cv2.polylines(image, [tip], True, INK, line, cv2.LINE_AA)
+        said = f"{percent(share)} {'above' if above else 'below'},", f"{'up' if above else 'down'} to {reach:.4g}"
+        base = end + sign * round(size_px * 1.1) + (round(-1.5 * size_px) if above else round(1.5 * size_px))
+        for number, text in enumerate(said):
+            write(image, text, right, base + number * size_px * 1.45, size_px * 0.85, QUIET)
+        top = min(top, round(base - size_px * 0.9)) if above else top
     marks = ticks(lo, hi)
     for value in marks:
         row = round(y + (hi - value) / (hi - lo) * (h - 1))
         cv2.line(image, (x + w, row), (x + w + round(size_px * 0.5), row), INK, line)
-        write(image, tick_label(value, marks), x + w + size_px * 0.9, row + size_px / 2, size_px)
-    write(image, scale.unit, x, y - size_px * 0.9 - (round(w * 0.7) if above else 0), size_px)
+        write(image, tick_label(value, marks), right, row + size_px / 2, size_px)
+    write(image, scale.unit, x, top - size_px * 1.4, size_px)

@@ -45,6 +45,13 @@ class Axis:
     hi: float
     step: float
 
+    @classmethod
+    def spanning(cls, label: str, lo: float, hi: float) -> Axis:
+        """An axis from lo to hi in the label's unit, with a round step that leaves at most nine ticks."""
+        rough = (hi - lo) / 9
+        power = 10.0 ** np.floor(np.log10(rough))
+        return cls(label, lo, hi, float(next(power * s for s in (1, 2, 5, 10) if power * s >= rough)))
+
     def ticks(self) -> list[float]:
         """Values that carry a tick."""
         first = int(np.ceil(self.lo / self.step - 1e-9))
@@ -147,11 +154,11 @@ class Plot:
     x: Axis
     y: Axis
     marks: Sequence[Mark]
-    legend: Corner = "ne"
+    legend: Corner = "ne"  # where it stands if no data lie there; else in another corner, or below the plot
 
     def draw(self, width: float, height: float, key: str) -> str:
         """SVG elements of the panel, width by height px, its origin at the top left. key : unique on the page."""
-        w, h = width - _LEFT - _RIGHT, height - _TOP - _BOTTOM
+        w, h, legend = width - _LEFT - _RIGHT, height - _TOP - _BOTTOM, _Legend.of(self.marks)
 
         def at(x: ArrayLike, y: ArrayLike) -> tuple[NDArray, NDArray]:
             (x_lo, x_hi), (y_lo, y_hi) = (a.scaled([a.lo, a.hi]) for a in (self.x, self.y))
@@ -160,6 +167,9 @@ class Plot:
                 _TOP + h * (y_hi - self.y.scaled(y)) / (y_hi - y_lo),
             )
 
+        corner = legend.free_corner(_drawn(self.marks, at), self.legend, (_LEFT, _TOP, w, h))
+        if corner is None:  # `at` follows h
+            h -= legend.height
         parts = [_text(_LEFT, 22, self.title, size=14, weight="600")]
         for v in self.x.ticks():
             px = float(at(v, self.y.lo)[0])
@@ -180,10 +190,10 @@ class Plot:
                 parts.append(_mark(mark, at))
         parts.append("</g>")
         parts.append(f'<rect x="{_LEFT}" y="{_TOP}" width="{w:.1f}" height="{h:.1f}" fill="none" stroke="#555"/>')
-        parts.append(_text(_LEFT + w / 2, height - 10, self.x.label, anchor="middle", size=12))
+        parts.append(_text(_LEFT + w / 2, _TOP + h + _BOTTOM - 10, self.x.label, anchor="middle", size=12))
         middle = _TOP + h / 2
         parts.append(_text(15, middle, self.y.label, anchor="middle", size=12, turn=f"rotate(-90 15 {middle:.1f})"))
-        parts.append(_legend(self.marks, self.legend, _LEFT, _TOP, w, h))
+        parts.append(legend.draw(*legend.place(corner, (_LEFT, _TOP, w, h))))
         return "".join(parts)
 
 
@@ -384,33 +394,89 @@ def _text(
     )
 
 
-def _legend(marks: Iterable[Mark], corner: Corner, left: float, top: float, w: float, h: float) -> str:
-    entries = [m for m in marks if not isinstance(m, Rule) and m.label]
-    if not entries:
-        return ""
-    width = 44 + _LETTER_PX * max(len(m.label) for m in entries)
-    height = 18 * len(entries) + 8
-    x = left + 8 if "w" in corner else left + w - width - 8
-    y = top + 8 if "n" in corner else top + h - height - 8
-    parts = [
-        f'<rect x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{height}" rx="3" fill="#ffffff" fill-opacity="0.86"'
-        ' stroke="#d5d5d5"/>'
-    ]
-    for i, m in enumerate(entries):
-        my = y + 17 + 18 * i - 4
-        if isinstance(m, Area):
-            at = f'x="{x + 8:.1f}" y="{my - 5:.1f}"'
-            parts.append(f'<rect {at} width="24" height="10" fill="{m.color}" fill-opacity="{m.opacity:g}"/>')
-        elif isinstance(m, Line):
-            dash = f' stroke-dasharray="{m.dash}"' if m.dash else ""
-            parts.append(
-                f'<line x1="{x + 8:.1f}" y1="{my:.1f}" x2="{x + 32:.1f}" y2="{my:.1f}" stroke="{m.color}"'
-                f' stroke-width="{m.width:g}"{dash}/>'
-            )
+def _drawn(marks: Iterable[Mark], at: Callable[[ArrayLike, ArrayLike], tuple[NDArray, NDArray]]) -> NDArray:
+    """(N, 2) px that marks cover, close enough together that none slips through a legend."""
+    parts = [np.empty((0, 2))]
+    for mark in marks:
+        if isinstance(mark, Rule):
+            continue
+        if isinstance(mark, Points):
+            y, error = np.asarray(mark.y, np.float64), 0.0 if mark.error is None else np.asarray(mark.error, np.float64)
+            parts += [np.stack(at(mark.x, y + share * error), axis=-1) for share in np.linspace(-1, 1, 33)]
+        elif isinstance(mark, Line):
+            parts.append(_dense(np.stack(at(mark.x, mark.y), axis=-1)))
         else:
-            parts.append(_dot(x + 20, my, m))
-        parts.append(_text(x + 38, my + 4, m.label, size=12))
-    return "".join(parts)
+            lower, upper = (_dense(np.stack(at(mark.x, y), axis=-1)) for y in (mark.lo, mark.hi))
+            parts += [lower + share * (upper - lower) for share in np.linspace(0, 1, 17)]
+    found = np.concatenate(parts)
+    return found[np.isfinite(found).all(axis=1)]
+
+
+def _dense(curve: NDArray) -> NDArray:
+    """A curve (N, 2) px with a point at least every few px."""
+    steps = np.linspace(0, 1, 64, endpoint=False)[:, None, None]
+    return np.concatenate([(curve[:-1] + steps * (curve[1:] - curve[:-1])).reshape(-1, 2), curve[-1:]])
+
+
+@dataclass(frozen=True, eq=False)
+class _Legend:
+    """What the labelled marks mean, in a box that must not lie on data."""
+
+    entries: Sequence[Line | Area | Points]
+
+    @classmethod
+    def of(cls, marks: Iterable[Mark]) -> _Legend:
+        return cls([m for m in marks if not isinstance(m, Rule) and m.label])
+
+    @property
+    def width(self) -> float:
+        return 44 + _LETTER_PX * max((len(m.label) for m in self.entries), default=0)
+
+    @property
+    def height(self) -> float:
+        return 18.0 * len(self.entries) + 8
+
+    def place(self, corner: Corner | None, frame: tuple[float, float, float, float]) -> tuple[float, float]:
+        """Left and top px of the box in a corner of the frame (left, top, width, height), or below it and its axis."""
+        left, top, w, h = frame
+        if corner is None:
+            return left, top + h + _BOTTOM - 4
+        x = left + 8 if "w" in corner else left + w - self.width - 8
+        return x, top + 8 if "n" in corner else top + h - self.height - 8
+
+    def free_corner(self, drawn: NDArray, wanted: Corner, frame: tuple[float, float, float, float]) -> Corner | None:
+        """The first corner, the wanted one first, where the box covers nothing drawn (N, 2) px; None: no corner."""
+        corners: tuple[Corner, ...] = ("ne", "nw", "se", "sw")
+        for corner in (wanted, *corners):
+            x, y = self.place(corner, frame)
+            near = (drawn > [x - 4, y - 4]) & (drawn < [x + self.width + 4, y + self.height + 4])
+            if not self.entries or not near.all(axis=1).any():
+                return corner
+        return None
+
+    def draw(self, x: float, y: float) -> str:
+        """SVG of the box with its top left at x, y px."""
+        if not self.entries:
+            return ""
+        parts = [
+            f'<rect x="{x:.1f}" y="{y:.1f}" width="{self.width:.1f}" height="{self.height:g}" rx="3" fill="#ffffff"'
+            ' fill-opacity="0.86" stroke="#d5d5d5"/>'
+        ]
+        for i, m in enumerate(self.entries):
+            my = y + 17 + 18 * i - 4
+            if isinstance(m, Area):
+                at = f'x="{x + 8:.1f}" y="{my - 5:.1f}"'
+                parts.append(f'<rect {at} width="24" height="10" fill="{m.color}" fill-opacity="{m.opacity:g}"/>')
+            elif isinstance(m, Line):
+                dash = f' stroke-dasharray="{m.dash}"' if m.dash else ""
+                parts.append(
+                    f'<line x1="{x + 8:.1f}" y1="{my:.1f}" x2="{x + 32:.1f}" y2="{my:.1f}" stroke="{m.color}"'
+                    f' stroke-width="{m.width:g}"{dash}/>'
+                )
+            else:
+                parts.append(_dot(x + 20, my, m))
+            parts.append(_text(x + 38, my + 4, m.label, size=12))
+        return "".join(parts)
 
 
 def _embed(rgb: UInt8, x: float, y: float, w: float, h: float) -> str:
@@ -421,8 +487,7 @@ def _embed(rgb: UInt8, x: float, y: float, w: float, h: float) -> str:
 
 def _color_bar(bar: Bar, x: float, y: float, height: float) -> str:
     rgb = palettes.apply(np.linspace(bar.hi, bar.lo, 256)[:, None], bar.palette, bar.lo, bar.hi)
-    step = next(s for s in (0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100) if (bar.hi - bar.lo) / s <= 9)
-    axis = Axis("", bar.lo, bar.hi, step)
+    axis = Axis.spanning("", bar.lo, bar.hi)
     parts = [
         _embed(rgb, x, y, 14, height).replace("<image ", '<image preserveAspectRatio="none" '),
         f'<rect x="{x:.1f}" y="{y:.1f}" width="14" height="{height:.1f}" fill="none" stroke="#555"/>',

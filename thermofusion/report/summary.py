@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..export.palettes import beyond_range
 from ..geometry.rigid import invert, rotation_angle_deg
 from ..recipe import Recipe
 from ..types import Scan, VertexFlag
@@ -56,6 +57,9 @@ def result_report(scan: Scan, recipe: Recipe, steps: Steps, reused: Sequence[str
     if steps.temperature is not None:
         report["temperature"] = _temperature(steps.temperature)
         messages += steps.temperature.messages
+    if steps.temperature is not None and recipe.output.range_degC is not None:
+        out = beyond_range(steps.temperature.mesh.temperature_degC, *recipe.output.range_degC)
+        messages += [f"{out}: `thermofusion export RESULT` draws them again in colours that fit"] if out else []
     report["quality"] = _quality(recipe, scan, steps)
     report["messages"] = messages
     report["stages_reused"] = list(reused)
@@ -63,35 +67,18 @@ def result_report(scan: Scan, recipe: Recipe, steps: Steps, reused: Sequence[str
 
 
 def summary(report: Mapping[str, Any], out: Path | None) -> str:
-    """A few lines for the terminal."""
+    """A few lines for the terminal, in words that need no manual."""
     r = report
-    lines = []
-    t = r["tracking"]
-    lines.append(
-        f"tracking     {t['tracked']} of {t['frames']} depth frames ({t['source']}), {len(t['lost'])} lost ranges"
-    )
+    lines = [f"camera path  {_path(r['tracking'])}"]
     if "surface" in r:
-        s = r["surface"]
-        lines.append(
-            f"surface      {s['vertices']:,} vertices, voxel {s['voxel_mm']:.1f} mm, grid {s['memory_gib']:.2f} GiB"
-        )
+        lines.append(f"surface      {r['surface']['vertices']:,} vertices, {r['surface']['voxel_mm']:.1f} mm apart")
     if "rig" in r:
-        a = r["rig"]
-        if a["changed"]:
-            change = f"turned {a['rotation_deg']:.2f}°, clock {a['time_offset_s'] * 1e3:+.0f} ms"
-        else:
-            change = "left as it was"
-        lines.append(f"rig          {change}; outline residual {_number(a['residual_px_after'])} px")
+        lines.append(f"rig          {_rig_line(r['rig'])}")
     if "mapping" in r:
-        v = r["mapping"]
-        lines.append(f"mapping      {v['used']} thermal views, {v['observations']:,} observations")
+        left = ", ".join(f"{n} ({why})" for why, n in r["mapping"]["left_out"].items() if n)
+        lines.append(f"thermal      {count(r['mapping']['used'], 'frame')} used{f'; left out: {left}' if left else ''}")
     if "temperature" in r:
-        t = r["temperature"]
-        level = "anchored" if t["anchored"] else "RELATIVE: no reference set the level"
-        lines.append(
-            f"temperature  {t['mode']}, {level}; median {_number(t['percentiles_degC']['50'])} °C, "
-            f"median sigma {_number(t['median_sigma_K'], 3)} K, {t['coverage']:.1%} of the surface"
-        )
+        lines += _temperature_lines(r["temperature"])
     lines += [f"note         {m}" for m in r["messages"]]
     lines += [f"BELOW GATE   {m}" for m in r["quality"]["failed"]]
     if out is not None:
@@ -99,8 +86,43 @@ def summary(report: Mapping[str, Any], out: Path | None) -> str:
     return "\n".join(lines)
 
 
-def _number(value: float | None, digits: int = 2) -> str:
-    return "-" if value is None or not np.isfinite(value) else f"{value:.{digits}f}"
+def count(n: int, noun: str) -> str:
+    """A number and its noun: 1 frame, 2 frames."""
+    return f"{n:,} {noun}" if n == 1 else f"{n:,} {noun}s"
+
+
+def _path(t: Mapping[str, Any]) -> str:
+    found = "as recorded" if t["source"] == "recorded" else "estimated from the depth frames"
+    if t["tracked"] == t["frames"]:
+        return f"{found}: {count(t['frames'], 'frame')}"
+    return f"{found}: {t['tracked']} of {count(t['frames'], 'frame')}; the others are left out"
+
+
+def _rig_line(a: Mapping[str, Any]) -> str:
+    fit = a["residual_px_after"]
+    fits = "" if fit is None or not np.isfinite(fit) else f"; outlines fit to {fit:.2f} px"
+    if not a["changed"]:
+        return f"the thermal camera stays where the recording says{fits}"
+    return f"thermal camera turned by {a['rotation_deg']:.2f}°, clock {a['time_offset_s'] * 1e3:+.0f} ms{fits}"
+
+
+def _temperature_lines(t: Mapping[str, Any]) -> list[str]:
+    """What is known of the skin's temperature, and what is not; nothing where nothing was measured."""
+    low, middle, high = (t["percentiles_degC"][p] for p in ("1", "50", "99"))
+    if middle is None:
+        return []
+    covered = f"{t['coverage']:.0%} of the surface measured"
+    sigma = t["median_sigma_K"]
+    between = "" if sigma is None or not np.isfinite(sigma) else f", sigma {sigma:.3f} K between places"
+    head = f"median {middle:.2f} °C, 98 % within {low:.2f} to {high:.2f} °C{between}; {covered}"
+    if t["mode"] == "apparent":
+        return [f"apparent     {head}", "level        the camera's own: nothing is corrected"]
+    name = "skin        " if t["mode"] == "absolute" else "straight on "
+    if not t["anchored"]:
+        known = "unknown: no reference set it. Differences on the body hold, °C as such do not"
+        return [f"{name} {head}", f"level        {known}"]
+    total = float(np.hypot.reduce([s for s in t["level_sigma_K"].values() if s is not None and np.isfinite(s)]))
+    return [f"{name} {head}", f"level        set by a reference, to ±{total:.2f} K"]
 
 
 def _scan(scan: Scan) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from .nouns import class_of, name_of
 TREE, NOTE = "__tree__", "__note__"
 MAX_TREE_BYTES = 64 << 20  # of JSON
 UNUSABLE = "the file is damaged, or no result of thermofusion"
-AGAIN = "run `thermofusion run` again"
+AGAIN = "`thermofusion run SCAN -o RESULT` writes it again"
 
 
 def save_artifact(path: Path, value: object, note: Mapping[str, Any] | None = None) -> None:

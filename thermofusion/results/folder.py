@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
@@ -13,6 +14,7 @@ from ..files.json import to_json
 from ..files.reading import read_json
 from ..files.whole import changing_over, write_text
 from ..recipe import Recipe
+from ..report.casts import DOUBTS
 from ..report.casts import VIEWS as FACES
 from ..report.summary import Steps, result_report
 from ..types import Scan, ThermalMesh, Trajectory
@@ -47,8 +49,14 @@ class Result(Steps):
         mesh = steps.temperature.mesh
         facts = {"version": __version__, "recipe": recipe.name, "frame": WORLD, **frame.axes}
         facts |= {"scan": scan.name, "run": run}
+        facts |= {} if scan.recorded_at is None else {"recorded_at": scan.recorded_at}
         mesh = replace(mesh, metadata={**facts, **mesh.metadata})
         return cls(**vars(steps), report=report, frame=frame, world_mesh=mesh)
+
+    def __repr__(self) -> str:
+        reached = "no surface" if self.surface is None else f"{len(self.surface.mesh)} vertices"
+        reached = reached if self.temperature is None else repr(self.temperature.mesh)
+        return f"<Result of scan {str(self.report.get('scan', {}).get('name', ''))[:40]!r}: {reached}>"
 
     @property
     def trajectory(self) -> Trajectory:
@@ -75,7 +83,7 @@ def names_of(recipe: Recipe) -> list[str]:
     """The files that a finished run writes, but for its stages."""
     names = ["recipe.resolved.toml", "trajectory.txt", "result.npz", REPORT]
     names += [f"mesh.{f}" for f in recipe.output.formats]
-    return [*names, *(f"{VIEWS}/{v}.png" for v in (*FACES, "overview") if recipe.output.views)]
+    return [*names, *(f"{VIEWS}/{v}.png" for v in (*FACES, "overview", *DOUBTS) if recipe.output.views)]
 
 
 def write_result(
@@ -128,8 +136,13 @@ def load_mesh(folder: Path, show: str = "absolute") -> ThermalMesh:
 
     path = folder / "result.npz"
     if not path.is_file():
-        raise ScanError("no finished result is here", place=folder, hint="run `thermofusion run` first")
+        there = (folder / "stages").is_dir()
+        cause = "the run is not finished, or was stopped before the temperature stage" if there else "no result is here"
+        command = f"`thermofusion run SCAN -o {shlex.quote(str(folder))}`"
+        raise ScanError(cause, place=folder, hint=f"{command} {'goes on from there' if there else 'writes one'}")
     temperature = load_artifact(path)
     if not isinstance(temperature, Temperature):
-        raise ScanError("it holds no temperatures", place=path, hint="run `thermofusion run` again")
+        raise ScanError(
+            "it holds no temperatures", place=path, hint="`thermofusion run SCAN -o RESULT` writes it again"
+        )
     return temperature.shown(show)

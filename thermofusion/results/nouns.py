@@ -60,7 +60,8 @@ def stored() -> MappingProxyType[str, type]:
             "surface/1": SurfaceResult,
             "temperature/1": Temperature,
             "thermal-camera/1": ThermalCamera,
-            "thermal-mesh/1": ThermalMesh,
+            "thermal-mesh/2": ThermalMesh,
+            "thermal-mesh/1": ThermalMesh,  # without `residual`
             "thermal-views/1": ThermalViews,
             "tracking/1": TrackingResult,
             "trajectory/1": Trajectory,

@@ -26,7 +26,7 @@ from ..errors import ScanError
 from ..geometry.rigid import interpolate_trajectory, invert
 from ..progress import Progress, silent
 from ..recipe import InputSection, RigSection
-from ..types import Float, Scan, SurfaceMesh, ThermalCamera, ThermalStream, Trajectory
+from ..types import Float, Scan, SurfaceMesh, ThermalCamera, ThermalStream, Trajectory, brief
 from .estimate import (
     CLOCK,
     NAMES,
@@ -69,6 +69,8 @@ class RigResult:
     converged: bool
     views_used: int
     messages: tuple[str, ...] = ()
+
+    __repr__ = brief
 
     @property
     def sigma_rotation_deg(self) -> float:
@@ -174,14 +176,9 @@ def _refined(outlines: OutlineSet, camera: ThermalCamera) -> RigResult:
     )
     if supported and solved.converged:
         return result
-    why = "did not come to rest" if not solved.converged else "is within what chance would give"
-    return replace(
-        result,
-        camera=camera,
-        residual_px_after=before,
-        changed=False,
-        messages=(f"the rig is left alone: a change ({found}) {why}",),
-    )
+    # a change that chance would explain is no news: the rig is as calibrated
+    news = () if solved.converged else (f"the rig is left alone: a change ({found}) did not come to rest",)
+    return replace(result, camera=camera, residual_px_after=before, changed=False, messages=news)
 
 
 def _described(change: Float) -> str:

@@ -23,13 +23,14 @@ class Format:
     """A kind of recording.
 
     name : what `--format` calls it. recognise : looks at file names only, quick, never raises. read : path -> Scan,
-    raises ScanError. what : one line for people.
+    raises ScanError. what : one line for people. signs : the files it is known by.
     """
 
     name: str
     recognise: Callable[[Path], bool]
     read: Callable[[Path], Scan]
     what: str
+    signs: str
 
 
 def _late(module: str, function: str) -> Callable:
@@ -41,24 +42,33 @@ def _late(module: str, function: str) -> Callable:
     return call
 
 
-def _reader(name: str, module: str, what: str) -> Format:
-    return Format(name, _late(module, "recognise"), _late(module, "read"), what)
+def _reader(name: str, module: str, what: str, signs: str) -> Format:
+    return Format(name, _late(module, "recognise"), _late(module, "read"), what, signs)
 
 
 # In the order of recognition: the more particular layouts first.
 FORMATS: tuple[Format, ...] = (
-    Format("native", is_native, read_native, "thermofusion's own folder: scan.json + frames.csv + images"),
-    _reader("azure-mkv", ".formats.azure", "Azure Kinect recording (.mkv), without the vendor's library"),
-    _reader("realsense-bag", ".formats.realsense", "RealSense recording (.bag), through Open3D"),
-    _reader(
-        "flir", ".thermal.flir", "FLIR radiometric JPEG or SEQ: thermal frames only, to be joined to a depth recording"
+    Format(
+        "native",
+        is_native,
+        read_native,
+        "thermofusion's own folder: scan.json + frames.csv + images",
+        "scan.json",
     ),
-    _reader("fakenect", ".formats.fakenect", "Kinect v1 recording of libfreenect's fakenect-record (INDEX.txt)"),
-    _reader("tum", ".formats.tum", "TUM RGB-D benchmark folder (rgb.txt, depth.txt, groundtruth.txt)"),
-    _reader("apc-shelf", ".formats.apcshelf", "Princeton shelf&tote folder (cam.info.txt, bit-rotated depth)"),
-    _reader("7-scenes", ".formats.sevenscenes", "7-Scenes / 3DMatch folder (frame-NNNNNN.{color,depth,pose})"),
-    _reader("jhu", ".formats.jhu", "laboratory layout of the paper: .pgm depth and _0000.raw thermal counts"),
-    _reader("redwood", ".formats.redwood", "Redwood / Open3D folder (color/ + depth/, camera_intrinsic.json)"),
+    _reader("azure-mkv", ".formats.azure", "Azure Kinect recording, without the vendor's library", "*.mkv"),
+    _reader("realsense-bag", ".formats.realsense", "RealSense recording, through Open3D", "*.bag"),
+    _reader(
+        "flir",
+        ".thermal.flir",
+        "FLIR radiometric JPEG or SEQ: thermal frames only, to be joined to a depth recording",
+        "FLIR *.jpg or *.seq",
+    ),
+    _reader("fakenect", ".formats.fakenect", "Kinect v1 recording of libfreenect's fakenect-record", "INDEX.txt"),
+    _reader("tum", ".formats.tum", "TUM RGB-D benchmark folder (groundtruth.txt: poses)", "rgb.txt and depth.txt"),
+    _reader("apc-shelf", ".formats.apcshelf", "Princeton shelf&tote folder (bit-rotated depth)", "cam.info.txt"),
+    _reader("7-scenes", ".formats.sevenscenes", "7-Scenes / 3DMatch folder", "frame-000000.depth.png"),
+    _reader("jhu", ".formats.jhu", "laboratory layout of the paper: depth and thermal counts", "*.pgm and *_0000.raw"),
+    _reader("redwood", ".formats.redwood", "Redwood / Open3D folder (camera_intrinsic.json)", "color/ and depth/"),
 )
 
 
@@ -85,7 +95,7 @@ def open_scan(path: str | Path, *, format: str | None = None) -> Scan:
         raise ScanError(
             "no known recording format was recognised here",
             place=root,
-            hint=f"name one with --format: {', '.join(f.name for f in FORMATS)}",
+            hint=f"looked for {', '.join(f'{f.signs} ({f.name})' for f in FORMATS)}; name one with --format",
         )
     try:
         scan = known.read(root)

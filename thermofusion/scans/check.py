@@ -356,9 +356,11 @@ def _rate_findings(streams: dict[str, StreamFigures]) -> list[Finding]:
 def _sync_findings(scan: Scan) -> list[Finding]:
     found = []
     if scan.color is not None:
-        _, dt = nearest_in_time(scan.depth.times_s, scan.color.times_s)
-        severity: Severity = "ok" if np.median(np.abs(dt)) < 0.04 else "warning"
-        text = f"nearest colour frame {np.median(dt) * 1e3:+.1f} ms (median), {np.abs(dt).max() * 1e3:.1f} ms at most"
+        slow, fast = sorted((scan.color.times_s, scan.depth.times_s), key=len)
+        _, dt = nearest_in_time(slow, fast)
+        away = np.median(np.abs(dt))
+        severity: Severity = "ok" if away < 0.04 else "warning"
+        text = f"nearest frame {away * 1e3:.1f} ms away (median), {np.abs(dt).max() * 1e3:.1f} ms at most"
         found.append(Finding(severity, "sync colour", text))
     if scan.thermal is not None:
         t, offset = scan.thermal.depth_times_s, scan.thermal.camera.time_offset_s

@@ -15,7 +15,7 @@ from ..geometry.normals import window_normals
 from ..geometry.rigid import interpolate_trajectory
 from ..progress import Progress, silent
 from ..recipe import InputSection, SubjectSection, SurfaceSection
-from ..types import Float, Float32, Int, Scan, SurfaceMesh, Trajectory
+from ..types import Float, Float32, Int, Scan, SurfaceMesh, Trajectory, brief
 from .clean import RemovedPart, subject_only
 from .color import color_vertices
 from .tsdf import BYTES_PER_BLOCK, FramePoses, Frames, VoxelGrid, integrate_frames, plan_grid, survey_depth
@@ -48,6 +48,8 @@ class SurfaceResult:
     floor_plane: Float | None
     removed: tuple[RemovedPart, ...]
     messages: tuple[str, ...]
+
+    __repr__ = brief
 
 
 class Tracked(Protocol):
@@ -123,7 +125,7 @@ def _extracted(grid: VoxelGrid, frames: int, min_weight: float, scan: Scan) -> t
         raise ScanError(
             f"{frames} depth frames made no surface: nothing was seen {min_weight:g} times",
             place=scan.root,
-            hint="the trajectory must be T_world_depth in metres; `thermofusion check` shows the streams",
+            hint="the trajectory must be T_world_depth in metres; `thermofusion check SCAN` shows the streams",
         )
     return canonical(vertices, triangles)
 

@@ -23,7 +23,7 @@ from scipy.sparse.csgraph import connected_components
 from ..errors import ScanError
 from ..physics.emissivity import AngleTable, EmissivityModel, reshaped, shape_direction
 from ..physics.equation import without_gain
-from ..types import Bool, Float, Float32, Observations
+from ..types import Bool, Float, Float32, Observations, brief
 from .field import ImageField
 from .layout import Layout
 from .problem import ThermalProblem
@@ -73,6 +73,8 @@ class Calibration:
     iterations: int
     converged: bool
     messages: tuple[str, ...]
+
+    __repr__ = brief
 
     @property
     def layout(self) -> Layout:

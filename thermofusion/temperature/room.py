@@ -19,6 +19,11 @@ class Room:
     air_K: float | None
     assumed: tuple[str, ...] = ()
 
+    def text(self) -> str:
+        """In a few words, for pictures."""
+        reflected = f"room {self.reflected_K - ZERO_DEGC_K:.1f} °C reflected{' (assumed)' if self.assumed else ''}"
+        return reflected if self.air_K is None else f"{reflected}, air {self.air_K - ZERO_DEGC_K:.1f} °C"
+
 
 def room_of(environment: Environment, settings: TemperatureSection) -> Room:
     """Recipe over scan over the default; what had to be assumed is said."""

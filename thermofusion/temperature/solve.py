@@ -17,10 +17,11 @@ from ..mapping.observe import Mapped
 from ..physics.band import ZERO_DEGC_K
 from ..progress import Progress, silent
 from ..recipe import MappingSection, TemperatureSection
-from ..types import Float32, OutputMode, Scan, SurfaceMesh, ThermalMesh, VertexFlag
+from ..types import Float32, OutputMode, Scan, SurfaceMesh, ThermalMesh, VertexFlag, brief
 from .blend import BlendResult, blend
 from .crosscal import Calibration, calibrate
 from .problem import ThermalProblem
+from .room import Room
 
 Sections = tuple[MappingSection, TemperatureSection]
 METHODS = ("nearest-view", "mean", "cos-resolution", "paper", "corrected-cos", "joint")
@@ -48,6 +49,8 @@ class Temperature:
     crosscal: dict[str, Any] = field(default_factory=dict)
     methods: dict[str, Any] = field(default_factory=dict)
     messages: tuple[str, ...] = ()
+
+    __repr__ = brief
 
     def shown(self, mode: str) -> ThermalMesh:
         """The mesh in another output mode. The uncertainty is the run's own mode's; for others it is unknown (NaN)."""
@@ -92,7 +95,7 @@ def solve(
     progress("temperature", 4, 4)
     body_fraction = None if problem.around is None else problem.around.body_fraction
     return Temperature(
-        mesh=_mesh(mesh, result, calibration, body_fraction),
+        mesh=_mesh(mesh, result, calibration, body_fraction, problem.room),
         absolute_degC=_degC(result.absolute_K),
         normal_equivalent_degC=_degC(result.normal_equivalent_K),
         apparent_degC=_degC(result.apparent_K),
@@ -130,6 +133,7 @@ def _mesh(
     result: BlendResult,
     calibration: Calibration | None,
     body_fraction: Float32 | None,
+    room: Room,
 ) -> ThermalMesh:
     flags = np.zeros(len(surface), np.uint8)
     flags[result.count == 1] |= np.uint8(VertexFlag.SINGLE_VIEW)
@@ -154,7 +158,8 @@ def _mesh(
         observations=result.count,
         flags=flags,
         uncertainty_parts=parts,
-        metadata={"uncertainty": UNCERTAINTY_MEANS, **level},
+        metadata={"uncertainty": UNCERTAINTY_MEANS, "room": room.text(), **level},
+        residual=result.residual,
     )
 
 

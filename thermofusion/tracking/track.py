@@ -20,7 +20,7 @@ from ..errors import ScanError
 from ..geometry.rigid import interpolate_trajectory, invert, se3_exp, se3_log
 from ..progress import Progress, silent
 from ..recipe import InputSection, SubjectSection, TrackingSection
-from ..types import Bool, Float, Scan, Trajectory
+from ..types import Bool, Float, Scan, Trajectory, brief
 from .fragments import Fragment
 from .frames import TrackingFrames
 from .joint import LOOP_APART, overlapping, solve_jointly
@@ -68,6 +68,8 @@ class TrackingResult:
     floor_plane: Float | None
     source: str
     messages: tuple[str, ...]
+
+    __repr__ = brief
 
 
 def locate(
@@ -324,13 +326,16 @@ def _messages(frames: TrackingFrames, lost: list[LostRange], converged: bool) ->
         messages.append("the shape alone leaves some motion free (a cylinder, a sphere); no colour helped to hold it")
     out = [r for r in lost if r.outcome == "left out"]
     if out:
-        count, ranges = sum(r.stop - r.start for r in out), ", ".join(f"{r.start}-{r.stop - 1}" for r in out)
+        count = sum(r.stop - r.start for r in out)
+        ranges = ", ".join(f"{r.start}-{r.stop - 1}" if r.stop - r.start > 1 else f"{r.start}" for r in out)
         n = len(frames.scan.depth)
-        messages.append(f"{count} of {n} depth frames could not be tracked and are left out (frames {ranges})")
+        frames_are = "frame could not be tracked and is" if count == 1 else "frames could not be tracked and are"
+        messages.append(f"{count} of {n} depth {frames_are} left out: {ranges}")
     joined = [r for r in lost if r.outcome == "joined"]
     if joined:
         at = ", ".join(str(r.start) for r in joined)
-        messages.append(f"tracking broke {len(joined)} times (before frames {at}) and was joined again")
+        broke = f"once (before frame {at})" if len(joined) == 1 else f"{len(joined)} times (before frames {at})"
+        messages.append(f"the camera path broke {broke}; its parts were joined again")
     return tuple(messages)
 
 

@@ -41,7 +41,7 @@ def read_picks_csv(path: Path, board: Board) -> list[BoardView]:
             raise ScanError(
                 f"point {row['point'][:40]} does not exist on a board of {board.columns} x {board.rows}",
                 place=place,
-                hint="check --columns and --rows",
+                hint="check columns and rows of the board in calibration.json",
             )
         if not (abs(u) <= MAX_PICK_PX and abs(v) <= MAX_PICK_PX):
             raise ScanError(f"u_px and v_px must lie within ±{MAX_PICK_PX} px", place=place)

@@ -31,6 +31,14 @@ def board_pdf(board: Board, *, paper: str | None = None) -> bytes:
     return draw_board(board, paper=paper).pdf()
 
 
+def paper_of(page: Page) -> str:
+    """What a page is printed on: `A4 landscape, 297 x 210 mm`."""
+    short, long = sorted((page.width_mm, page.height_mm))
+    name = next(n for n, size_mm in PAPER_MM.items() if size_mm == (short, long))
+    way = "portrait" if page.height_mm > page.width_mm else "landscape"
+    return f"{name} {way}, {page.width_mm:.0f} x {page.height_mm:.0f} mm"
+
+
 def draw_board(board: Board, *, paper: str | None = None) -> Page:
     """The page with the board, a scale bar and a line on how to print and measure it.
 
@@ -118,7 +126,7 @@ def _foot(page: Page, board: Board) -> None:
         page.lines.append((EDGE_MM + 10 * k, y - (3 if k % 5 == 0 else 1.5), EDGE_MM + 10 * k, y, 0.25))
     page.lines.append((EDGE_MM, y, EDGE_MM + length, y, 0.25))
     page.texts.append((EDGE_MM + length + 3, y, 3.5, f"{length:.0f} mm: measure after printing (100 %, no fitting)"))
-    page.texts.append((EDGE_MM, y + 6, 3.5, _caption(board)))
+    page.texts.append((EDGE_MM, y + 6, 3.5, f"{_caption(board)}; {paper_of(page)}"))
     page.texts.append((EDGE_MM, y + 11, 3.5, _advice(board)))
 
 

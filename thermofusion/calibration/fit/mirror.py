@@ -38,7 +38,7 @@ def refuse_mirrored(data: CalibrationSet) -> None:
             raise ScanError(
                 f"the {camera} pictures are mirrored: the board's points run the wrong way round in {len(views)} of "
                 f"{seen} views",
-                hint=f"switch the driver's mirroring off, or calibrate with mirrored={{'{camera}'}}",
+                hint=f'switch the driver\'s mirroring off, or write `"mirrored": ["{camera}"]` in calibration.json',
             )
         if views:
             raise ScanError(
@@ -64,7 +64,7 @@ def refuse_mirrored_pair(first: str, poses_a: Mapping[str, Float], second: str, 
         raise ScanError(
             f"the {first} and the {second} pictures are mirrored against each other: boards turned to the left in one "
             "are turned to the right in the other",
-            hint=f"switch the driver's mirroring off, or name one of them under `mirrored`: {second} or {first}",
+            hint=f"switch the driver's mirroring off, or name {second} or {first} under `mirrored` in calibration.json",
         )
 
 
@@ -85,7 +85,7 @@ def refuse_mirrored_depth(plain: tuple[Float, Float], flipped: tuple[Float, Floa
     if _normal_misfit(*flipped) * CLEARLY < misfit:
         raise ScanError(
             "the depth images are mirrored against the pictures: flipped left to right they fit",
-            hint="switch the driver's mirroring off, or name `depth` under `mirrored`",
+            hint="switch the driver's mirroring off, or name `depth` under `mirrored` in calibration.json",
         )
 
 

@@ -134,7 +134,11 @@ def read_curve(path: Path) -> RadiometricCurve:
     """Read curve.json. Raises ScanError naming the key, or where the curve turns."""
     raw = read_json(path)
     if not isinstance(raw, dict) or raw.get("schema") != CURVE_SCHEMA:
-        raise ScanError("this is no curve file", place=path, hint="write one with `thermofusion thermal curve`")
+        raise ScanError(
+            "this is no curve file",
+            place=path,
+            hint="`thermofusion thermal curve READINGS.csv` writes one",
+        )
     doc = validated(_CurveDoc, {"schema_": raw["schema"], **raw}, path)
     c = doc.signal.curve
     if c is None or c.type not in ("polynomial", "planck"):
@@ -159,7 +163,7 @@ def write_field(path: Path, field: PixelField) -> None:
 
 def read_field(path: Path) -> PixelField:
     """Read a pixel field. Raises ScanError if the file is none."""
-    (z,) = read_npz(path, "pixel field", ["z"], hint="write one with `thermofusion thermal field`")
+    (z,) = read_npz(path, "pixel field", ["z"], hint="`thermofusion thermal field READINGS.csv` writes one")
     if z.ndim != 3 or z.dtype.kind != "f" or not np.isfinite(z).all():
         raise ScanError("a pixel field holds finite `z` of three axes: power, row, column", place=path)
     return PixelField(z.astype(np.float32))

@@ -130,7 +130,11 @@ def with_thermal(
         )
     times = frames.times_s if times_s is None else np.asarray(times_s, np.float64)
     if not np.isfinite(times).all():
-        raise ScanError("the thermal frames state no times", place=frames.places[0], hint="give times_s")
+        raise ScanError(
+            "the thermal frames state no times",
+            place=frames.places[0],
+            hint="record a SEQ file, or JPEGs that state their time",
+        )
     images = frames.images
     stream = make_stream(times, lambda i: images[i], frames.places, place=frames.places[0], kind="thermal")
     notes = (*scan.notes, *frames.notes, f"thermal frames joined by {path.name}")

@@ -19,6 +19,7 @@ from ...errors import ResourceError, ScanError
 from ...files.reading import PNG_MAGIC, decode_image, read_bytes
 from ...files.tum import write_trajectory
 from ...files.whole import replacing_folder
+from ...progress import Progress, silent
 from ...types import BlackbodyReference, Camera, Reference, Scan, Stream, ThermalCamera, Trajectory
 from ..common import Kind, as_loaded, as_thermal
 from .schema import SCHEMA, STREAMS
@@ -31,20 +32,20 @@ _BYTES_PER_PIXEL = {"depth": 2.0, "color": 3.0, "thermal": 4.0}  # before compre
 # ---------------------------------------------------------------- writing
 
 
-def write_scan(scan: Scan, out: str | Path, overwrite: bool = False) -> Path:
+def write_scan(scan: Scan, out: str | Path, overwrite: bool = False, progress: Progress = silent) -> Path:
     """Write `scan` as a native folder `out`; returns its path.
 
     Images that already lie in files with the right content are copied byte for byte, others become PNG (float thermal:
     TIFF). Everything is written to a temporary folder beside `out`, then renamed: a failure leaves nothing behind.
 
-    Raises ScanError where `out` exists (unless `overwrite` and it is a scan folder) or a frame cannot be read;
-    ResourceError if the disk has no room.
+    progress : called with (stream, frames written, frames in all). Raises ScanError where `out` exists (unless
+    `overwrite` and it is a scan folder) or a frame cannot be read; ResourceError if the disk has no room.
     """
     out = Path(out)
     _check_target(scan, out, overwrite)
     _check_room(scan, out.parent)
     with replacing_folder(out) as folder:
-        rows = [row for kind in STREAMS for row in _write_stream(scan, kind, folder)]
+        rows = [row for kind in STREAMS for row in _write_stream(scan, kind, folder, progress)]
         rows.sort(key=lambda row: (float(row[2]), row[0]))
         (folder / "frames.csv").write_text(_csv(rows), encoding="utf-8")
         (folder / "scan.json").write_text(json.dumps(scan_json(scan), indent=1) + "\n", encoding="utf-8")
@@ -113,7 +114,7 @@ def _reference(r: Reference) -> dict[str, Any]:
     return {**common, "p_world_m": r.p_world_m.tolist()}
 
 
-def _write_stream(scan: Scan, kind: Kind, folder: Path) -> list[list[str]]:
+def _write_stream(scan: Scan, kind: Kind, folder: Path, progress: Progress) -> list[list[str]]:
     stream: Stream | None = getattr(scan, kind)
     if stream is None:
         return []
@@ -126,6 +127,7 @@ def _write_stream(scan: Scan, kind: Kind, folder: Path) -> list[list[str]]:
         (folder / name).write_bytes(data)
         shutter = "" if stream.usable[i] else "1"
         rows.append([kind, str(int(stream.index[i])), repr(float(stream.times_s[i])), name, shutter])
+        progress(kind, i + 1, len(stream))
     return rows
 
 
@@ -178,7 +180,7 @@ def _check_target(scan: Scan, out: Path, overwrite: bool) -> None:
     if out.resolve() == scan.root.resolve() or scan.root.resolve().is_relative_to(out.resolve()):
         raise ScanError("a scan cannot be written over itself", place=out, hint="choose another folder")
     if not overwrite:
-        raise ScanError("it exists already", place=out, hint="choose another folder, or overwrite it")
+        raise ScanError("it exists already", place=out, hint="choose another folder, or give --overwrite")
     if not out.is_dir() or (any(out.iterdir()) and not (out / "scan.json").is_file()):
         raise ScanError("it exists and is no scan folder, so it is not overwritten", place=out)
 

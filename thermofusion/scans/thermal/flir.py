@@ -8,6 +8,7 @@ each layer of the path (air, window, air) passing its share of what lies behind 
 
 from __future__ import annotations
 
+import shlex
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -116,7 +117,7 @@ def read(path: Path) -> Scan:
     raise ScanError(
         f"a thermal recording alone ({n} frames of {w} x {h} px), no depth to put it on",
         place=path,
-        hint="join it to its depth recording with scans.with_thermal and a rig.json",
+        hint=f"`thermofusion import RECORDING -o SCAN --thermal {shlex.quote(str(path))} --rig rig.json` joins them",
     )
 
 
