@@ -68,7 +68,7 @@ def test_a_result_folder_is_complete(demo):
     files = [p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file() and "stages" not in p.parts]
     names = set(files) - {".thermofusion.lock"}
     assert names == set(json.loads((out / "result.json").read_text())["files"])
-    views = {f"views/{v}.png" for v in ("front", "back", "left", "right", "overview")}
+    views = {f"views/{v}.png" for v in ("front", "back", "left", "right", "overview", "uncertainty", "residual")}
     assert names == {
         *("mesh.ply", "mesh.glb", "mesh.vtp", "trajectory.txt", "result.json", "result.npz", "recipe.resolved.toml"),
         *views,

@@ -74,6 +74,22 @@ def test_links_lead_somewhere(page):
             assert (page.parent / target).exists(), f"{page.name}: {target}"
 
 
+def test_readmes_python_runs_and_writes(tmp_path, monkeypatch):
+    """As it stands, on an excerpt of the demo under the name that it uses."""
+    pytest.importorskip("pandas")
+    import thermofusion as tf
+    from thermofusion.scans.native.write import excerpt, write_scan
+
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    code = re.search(r"<!-- python -->\n```python\n(.*?)```", text, re.DOTALL).group(1)
+    scan = tf.open_scan(data_dir() / "demo")
+    write_scan(excerpt(scan, depth=slice(0, 12), color=slice(0, 4), thermal=slice(0, 4)), tmp_path / "my-scan")
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "README.md", "exec"), {})
+    names = {p.name for p in (tmp_path / "result").iterdir()}
+    assert {"mesh.ply", "mesh.glb", "result.json", "views", "skin.csv"} <= names
+
+
 def test_shipped_data_are_registered_with_their_hashes():
     registry = tomllib.loads((data_dir() / "registry.toml").read_text(encoding="utf-8"))
     listed = set()

@@ -123,7 +123,7 @@ def test_what_was_looked_for_is_said(tmp_path):
 def test_an_unfinished_result_says_how_to_go_on(tmp_path):
     folder = tmp_path / "my result"
     (folder / "stages").mkdir(parents=True)
-    with pytest.raises(ScanError, match="not finished") as e:
+    with pytest.raises(ScanError, match="did not reach the temperature stage") as e:
         load_mesh(folder)
     assert f"`thermofusion run SCAN -o '{folder}'` goes on from there" in e.value.sentence()
 

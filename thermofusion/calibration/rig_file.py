@@ -118,7 +118,7 @@ def read_rig(path: Path) -> RigFile:
     tree = read_json(path, "rig")
     if not isinstance(tree, dict) or tree.get("schema") != SCHEMA:
         raise ScanError(
-            f"key 'schema': expected '{SCHEMA}'", place=path, hint="write one with `thermofusion calibrate`"
+            f"key 'schema': expected '{SCHEMA}'", place=path, hint="`thermofusion calibrate PICTURES` writes one"
         )
     doc = validated(RigDoc, tree, path)
     if "extrinsics" not in doc.model_fields_set:

@@ -95,7 +95,7 @@ def low_high(text: str | None, unit: str) -> tuple[float, float] | None:
 def help_alone(context: typer.Context) -> None:
     """A group of verbs that is called without one prints its help; that is no error."""
     if context.invoked_subcommand is None:
-        print(context.get_help())
+        say(context.get_help())
         raise typer.Exit
 
 

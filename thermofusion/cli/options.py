@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from .console import note
+from .console import low_high, note
 
 if TYPE_CHECKING:
     from ..recipe import Recipe
@@ -59,6 +59,20 @@ class Processing:
         shorthand |= {"output.compare_methods": "true"} if self.method == "all" else {"temperature.method": self.method}
         overrides += [f"{key}={value}" for key, value in shorthand.items() if value is not None]
         return load_recipe(self.recipe, overrides, note=note)
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """How a result is coloured and how large its pictures are."""
+
+    palette: Annotated[str, typer.Option(help="inferno, iron, grey, cividis, rainbow.")] = "inferno"
+    range_: Annotated[str | None, typer.Option("--range", help="Colour range in °C, low:high.")] = None
+    size: Annotated[int, typer.Option("--size", min=300, max=6000, help="Height of the pictures, px.")] = 900
+
+    @property
+    def range_degC(self) -> tuple[float, float] | None:
+        """The two ends of the range. Raises RecipeError."""
+        return low_high(self.range_, "°C")
 
 
 def spelled_out(verb: Callable[..., T]) -> Callable[..., T]:

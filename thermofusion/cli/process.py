@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from ..errors import QualityError
-from .console import emit, low_high, named, note, progress
-from .options import Json, Processing, Recording, spelled_out
+from .console import emit, named, note, progress
+from .options import Drawing, Json, Processing, Recording, spelled_out
 
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what stands in the result folder.")]
 STAGES = "tracking, surface, rig, mapping, temperature"  # pipeline.STAGE_NAMES, which --help has no time to load
@@ -19,7 +19,7 @@ def register(app: typer.Typer) -> None:
     """Add this module's verbs."""
     app.command()(spelled_out(run))
     app.command()(demo)
-    app.command()(export)
+    app.command()(spelled_out(export))
 
 
 def run(
@@ -72,11 +72,9 @@ def demo(
 
 def export(
     result: Annotated[Path, typer.Argument(help="A result folder.")],
+    drawing: Drawing,
     formats: Annotated[str, typer.Option("--format", help="Comma-separated: ply, glb, vtp, csv.")] = "ply,glb,vtp",
-    palette: Annotated[str, typer.Option(help="inferno, iron, grey, cividis, rainbow.")] = "inferno",
-    range_: Annotated[str | None, typer.Option("--range", help="Colour range in °C, low:high.")] = None,
     show: Annotated[str, typer.Option(help="absolute, normal-equivalent or apparent.")] = "absolute",
-    size: Annotated[int, typer.Option("--size", min=300, max=6000, help="Height of the pictures, px.")] = 900,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder; the result's own by default.")] = None,
     json: Json = False,
 ) -> None:
@@ -86,13 +84,13 @@ def export(
     from ..export.palettes import beyond_range
     from ..report.pictures import write_views
 
-    limits = low_high(range_, "°C")
+    palette, limits = drawing.palette, drawing.range_degC
     mesh = pipeline.load_mesh(result, show)
     folder = result if out is None else named(out)
     mode = "" if show == "absolute" else f"-{show}"  # other modes never replace the corrected mesh and its pictures
     wanted = tuple(f.strip() for f in formats.split(","))
     written = write(mesh, folder, wanted, palette=palette, range_degC=limits, name=f"mesh{mode}")
-    written += write_views(mesh, folder / f"views{mode}", palette=palette, range_degC=limits, height_px=size)
+    written += write_views(mesh, folder / f"views{mode}", palette=palette, range_degC=limits, height_px=drawing.size)
     if folder.resolve() == result.resolve():
         pipeline.add_files(result, written)
     outside = "" if limits is None else beyond_range(mesh.temperature_degC, *limits)

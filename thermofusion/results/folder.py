@@ -137,7 +137,7 @@ def load_mesh(folder: Path, show: str = "absolute") -> ThermalMesh:
     path = folder / "result.npz"
     if not path.is_file():
         there = (folder / "stages").is_dir()
-        cause = "the run is not finished, or was stopped before the temperature stage" if there else "no result is here"
+        cause = "the run did not reach the temperature stage" if there else "no finished result is here"
         command = f"`thermofusion run SCAN -o {shlex.quote(str(folder))}`"
         raise ScanError(cause, place=folder, hint=f"{command} {'goes on from there' if there else 'writes one'}")
     temperature = load_artifact(path)

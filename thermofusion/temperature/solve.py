@@ -66,7 +66,12 @@ class Temperature:
             raise RecipeError(f"there is no output mode '{mode}'", hint=f"choose from {', '.join(values)}")
         unknown = np.full(len(self.mesh), np.nan, np.float32)
         return replace(
-            self.mesh, temperature_degC=values[chosen], mode=chosen, uncertainty_K=unknown, uncertainty_parts={}
+            self.mesh,
+            temperature_degC=values[chosen],
+            mode=chosen,
+            uncertainty_K=unknown,
+            uncertainty_parts={},
+            residual=None,
         )
 
 
