@@ -7,6 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 from support.result_maker import result, sphere
 
 from thermofusion.errors import RecipeError
@@ -340,3 +341,12 @@ def test_no_triangles_is_an_error():
     surface = replace(sphere(), triangles=np.zeros((0, 3), np.int32))
     with pytest.raises(ValueError, match="without triangles"):
         cast_views(surface, np.eye(3), 100)
+
+
+def test_a_picture_keeps_its_texts_for_other_readers(tmp_path):
+    image = np.zeros((3, 4, 3), np.uint8)
+    path = write_png(tmp_path / "a.png", image, {"Scan": "Müller 71 µ", "Run": "ab12"})
+    with Image.open(path) as picture:
+        assert picture.text == {"Scan": "Müller 71 µ", "Run": "ab12"}  # type: ignore[attr-defined]
+        assert picture.size == (4, 3)
+    assert np.array_equal(cv2.imread(str(path)), image)

@@ -7,10 +7,14 @@ is known of the level, how the values spread, what lies outside the colours, and
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -28,6 +32,7 @@ from .lettering import ALERT, INK, LEFT_TO_RIGHT, QUIET, Scale
 
 HEIGHT_PX = 900  # of a page; all sizes on it follow
 SHADING = 0.12  # of pages of a result: seen at 45°, a colour loses 4 % of its light; at the very edge 12 %
+PNG_HEAD = 33  # bytes of the signature and IHDR, behind which texts may stand
 SHAPE_SHADING = 0.75  # of geometry alone, where no colour is to be read
 SHAPE_RGB = (222, 220, 214)  # of a surface without colour
 RESIDUAL_RANGE = (0.0, 3.0)  # sigmas: beyond 3 a vertex is flagged HIGH_RESIDUAL
@@ -94,12 +99,16 @@ def write_views(
     for name, (values, scale) in _doubts(mesh).items():
         pictures[name] = draw(casts, values, scale, height_px=height_px, overview_only=True)["overview"]
     paths = [Path(folder) / f"{name}.png" for name in pictures]
+    whose = {k.capitalize(): str(mesh.metadata[k]) for k in ("scan", "run") if k in mesh.metadata}
     with ThreadPoolExecutor(max_workers=2) as pool:
-        return list(pool.map(write_png, paths, pictures.values()))
+        return list(pool.map(partial(write_png, texts=whose), paths, pictures.values()))
 
 
-def write_png(path: str | Path, image: UInt8) -> Path:
-    """Write an RGB (H, W, 3) or grey (H, W) picture, whole or not at all, its folder made. Raises ResourceError."""
+def write_png(path: str | Path, image: UInt8, texts: Mapping[str, str] = MappingProxyType({})) -> Path:
+    """Write an RGB (H, W, 3) or grey (H, W) picture, whole or not at all, its folder made. Raises ResourceError.
+
+    texts : by keyword, kept in the file (PNG's iTXt chunks, ISO/IEC 15948, 11.3.4).
+    """
     path = Path(path)
     if image.dtype != np.uint8 or image.shape[2:] not in ((), (3,)) or image.size == 0:
         raise ValueError(f"a picture of shape {image.shape} and type {image.dtype} cannot be written")
@@ -108,7 +117,13 @@ def write_png(path: str | Path, image: UInt8) -> Path:
     except OSError as e:
         raise ResourceError(f"the folder cannot be made ({e.strerror})", place=path.parent) from None
     _, data = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)
-    return write_whole(path, [data.tobytes()])
+    png = data.tobytes()
+    return write_whole(path, [png[:PNG_HEAD], *(_text_chunk(k, v) for k, v in texts.items()), png[PNG_HEAD:]])
+
+
+def _text_chunk(keyword: str, text: str) -> bytes:
+    body = b"iTXt" + keyword.encode("latin-1") + bytes(5) + text.encode()  # not compressed, of no language
+    return struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
 
 
 # ---------------------------------------------------------------- drawing
