@@ -49,6 +49,8 @@ def main(argv: list[str] | None = None) -> None:
     as_json = "--json" in arguments
     try:
         code = app(args=arguments, standalone_mode=False)
+    except SystemExit as e:
+        leave(READER_GONE if e.code == 1 else int(e.code or 0))  # 1 is the library's own, for a pipe that nobody reads
     except ThermofusionError as e:
         fail(e.sentence(), e.exit_code, as_json)
     except (KeyboardInterrupt, typer.Abort):
