@@ -152,7 +152,7 @@ def _coverage_plot(calibration: Calibration, camera: str) -> Plot:
     ]
     marks.append(Points(px[:, 0], h - px[:, 1], COLORS[camera], radius=1.2))
     x, y = Axis.spanning("px from the left", 0, w), Axis.spanning("px from the bottom", 0, h)
-    return Plot(f"{camera}: where the board was seen", x, y, marks)
+    return Plot(f"{camera}: where the board was seen; red: never", x, y, marks)
 
 
 def _picture(caption: str, image: NDArray[np.uint8]) -> str:
