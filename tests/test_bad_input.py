@@ -239,7 +239,7 @@ FAULTS = {
     "emissivity of a reference": (put("references.0.emissivity", 1.5), "emissivity"),
     "reference of unknown kind": (put("references.0.kind", "candle"), "references.0"),
     "humidity": (put("environment.relative_humidity_pct", 450), "relative_humidity_pct"),
-    "missing column": (rename_column, "column(s) time_s"),
+    "missing column": (rename_column, "1 column missing: time_s"),
     "empty csv": (file("frames.csv", b""), "empty"),
     "header only": (frames(lambda rows: rows.clear()), "no depth frames"),
     "csv with NUL": (file("frames.csv", b"stream,index,time_s,path\ndepth,0,0,\0.png\n"), "not usable"),

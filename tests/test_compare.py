@@ -208,7 +208,7 @@ def test_contact_readings(tmp_path):
 @pytest.mark.parametrize(
     ("name", "text", "match"),
     [
-        ("a.csv", "x_m,y_m,z_m,degC\n0,0,0,33\n", r"column\(s\) uncertainty_K are missing"),
+        ("a.csv", "x_m,y_m,z_m,degC\n0,0,0,33\n", "1 column missing: uncertainty_K"),
         ("a.csv", "x_m,y_m,z_m,degC,uncertainty_K\n", "no contact reading"),
         ("a.csv", "x_m,y_m,z_m,degC,uncertainty_K\n0,0,zero,33,0.1\n", "reading 1"),
         ("a.csv", "x_m,y_m,z_m,degC,uncertainty_K\n0,0,0,33,-1\n", "uncertainty_K"),

@@ -20,11 +20,11 @@ from typer.main import get_command
 import thermofusion as tf
 from thermofusion import pipeline
 from thermofusion.cli import app
-from thermofusion.errors import ScanError
+from thermofusion.errors import ScanError, counted
 from thermofusion.files.shipped import data_dir
 from thermofusion.recipe import Recipe
 from thermofusion.report import plot
-from thermofusion.report.summary import count, summary
+from thermofusion.report.summary import summary
 from thermofusion.results.folder import load_mesh
 from thermofusion.types import VertexFlag
 
@@ -152,7 +152,7 @@ def test_the_summary_says_what_is_known():
     assert "set by a reference, to ±0.10 K" in anchored
     assert "nothing is corrected" in report(mode="apparent")
     assert "°C" not in report(percentiles_degC={"1": None, "50": None, "99": None})
-    assert [count(n, "frame") for n in (0, 1, 1200)] == ["0 frames", "1 frame", "1,200 frames"]
+    assert [counted(n, "frame") for n in (0, 1, 1200)] == ["0 frames", "1 frame", "1,200 frames"]
 
 
 # ---------------------------------------------------------------- from Python

@@ -248,7 +248,7 @@ def test_seven_scenes_drops_lost_poses_and_far_invalid(tmp_path):
     scan = open_scan(tmp_path)
     assert np.isnan(scan.depth.load(0)[0]).all()
     assert len(scan.trajectory) == 2
-    assert any("1 frames have no finite pose" in n for n in scan.notes)
+    assert any("1 frame without a finite pose" in n for n in scan.notes)
 
 
 # ---------------------------------------------------------------- fakenect

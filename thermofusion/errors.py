@@ -35,6 +35,11 @@ def _clause(text: str) -> str:
     return shown if len(shown) <= LONGEST_CLAUSE else f"{shown[:LONGEST_CLAUSE]}..."
 
 
+def counted(n: int, noun: str) -> str:
+    """A number and its noun: 1 frame, 2 frames."""
+    return f"{n:,} {noun}" if n == 1 else f"{n:,} {noun}s"
+
+
 class ThermofusionError(Exception):
     """Root of all errors that a user can act on.
 

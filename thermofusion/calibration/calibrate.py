@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ScanError
+from ..errors import ScanError, counted
 from ..progress import Progress, silent
 from ..types import Float, UInt8
 from .board.board import Board
@@ -100,7 +100,9 @@ def _next_steps(folder: CalibrationFolder, result: Calibration, picked: Calibrat
     next_steps = tuple(s for c in result.single for s in advice(coverage(result, c)))
     burnt = [n for n in folder.files.get("thermal", {}) if n in result.views_used() and is_saturated(folder.thermal(n))]
     if burnt:
-        text = f"{len(burnt)} thermal pictures are saturated ({', '.join(burnt[:5])}): widen the temperature range"
+        text = (
+            f"saturated: {counted(len(burnt), 'thermal picture')} ({', '.join(burnt[:5])}): widen the temperature range"
+        )
         next_steps = (text, *next_steps)
     return next_steps if picked is None else (*_interpolated_picks(picked), *next_steps)
 

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from ..errors import RecipeError
+from ..errors import RecipeError, counted
 from .console import emit, progress
 from .options import spelled_out
 
@@ -67,7 +67,7 @@ def calibrate(
     pictures = {f"{camera} {name}": done.picture(camera, name) for camera, name in names}
     page = report or out.with_suffix(".html")
     write_text(page, report_html(done.calibration, advice=done.advice, pictures=pictures))
-    lines = [f"{camera:<8} {n} views with the board" for camera, n in done.found.items()]
+    lines = [f"{camera:<8} {counted(n, 'view')} with the board" for camera, n in done.found.items()]
     lines += [f"note     {text}" for text in done.calibration.notes]
     lines += [f"next     {text}" for text in done.advice]
     emit(document, "\n".join([*lines, f"wrote {out} and {page}"]), json)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ..errors import RecipeError, ScanError
+from ..errors import RecipeError, ScanError, counted
 from ..progress import Progress
 from .console import emit, help_alone, low_high, note, progress
 from .options import spelled_out
@@ -93,7 +93,8 @@ def curve(
     write_curve(out, document)
     (lo, hi), (cold, warm) = document["counts_range"], document["degC_range"]
     text = (
-        f"{chosen.model} from {len(table)} readings, for {lo:.0f} to {hi:.0f} counts ({cold:.2f} to {warm:.2f} °C)\n"
+        f"{chosen.model} from {counted(len(table), 'reading')}, "
+        f"for {lo:.0f} to {hi:.0f} counts ({cold:.2f} to {warm:.2f} °C)\n"
         f"residual {fitted.residual_K * 1e3:.2f} mK rms; the curve itself is good to {fitted.sigma_K * 1e3:.2f} mK\n"
         f"wrote {out}"
     )
@@ -155,7 +156,7 @@ def flatten(
     else:
         write_flat(frames, out, pixel_field, chosen, overwrite=overwrite)
     value = {"written": out, "frames": len(frames), "before_K": before, "after_K": after}
-    text = f"{len(frames)} frames; the first spreads over {before:.3f} K, now over {after:.3f} K (one sigma)"
+    text = f"{counted(len(frames), 'frame')}; the first spreads over {before:.3f} K, now over {after:.3f} K (one sigma)"
     emit(value, f"{text}\nwrote {out}", json)
 
 

@@ -7,15 +7,17 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from ..errors import ScanError
+from ..errors import ScanError, counted
 from .reading import MAX_LINE, text_lines
 
 
-def table_rows(path: Path, kind: str, needed: Sequence[str]) -> Iterator[tuple[int, dict[str, str]]]:
+def table_rows(
+    path: Path, kind: str, needed: Sequence[str], hint: str | None = None
+) -> Iterator[tuple[int, dict[str, str]]]:
     """(number of its last line, cells by column) of every row; cells are trimmed, absent ones empty.
 
-    kind : what the file is, for messages. needed : columns that must be there. Raises ScanError: no such columns, a
-    column twice, a row of more cells than columns or of more than `MAX_LINE` characters, and what `text_lines` raises.
+    kind : what the file is, for messages. needed : columns that must be there, or else `hint` is given. Raises
+    ScanError: no such columns, a column twice, a row of more cells than columns or of more than `MAX_LINE` characters, and what `text_lines` raises.
     """
     lines = _Lines(path, kind)
     reader = csv.reader(lines, skipinitialspace=True, strict=False)
@@ -23,7 +25,7 @@ def table_rows(path: Path, kind: str, needed: Sequence[str]) -> Iterator[tuple[i
         head = [name.strip() for name in next(reader, [])]
         missing = [name for name in needed if name not in head]
         if missing:
-            raise ScanError(f"column(s) {', '.join(missing)} are missing", place=path)
+            raise ScanError(f"{counted(len(missing), 'column')} missing: {', '.join(missing)}", place=path, hint=hint)
         twice = [name for name, count in Counter(head).items() if name and count > 1]
         if twice:
             raise ScanError(f"the column {twice[0][:40]} stands twice", place=path)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import RecipeError, ScanError
+from ..errors import RecipeError, ScanError, counted
 from ..export import read_mesh
 from ..export.columns import result_from, surface_from
 from ..files.npz import read_npz
@@ -66,7 +66,7 @@ class Agreement:
     ) -> Agreement:
         """Of paired temperatures (N,), all finite. Raises ScanError with fewer than two."""
         if len(first) < 2:
-            raise ScanError(f"{len(first)} pairs of temperatures are too few to compare")
+            raise ScanError(f"{counted(len(first), 'pair')} of temperatures: too few to compare")
         d, mean = np.asarray(first, np.float64) - second, (np.asarray(first, np.float64) + second) / 2
         w = np.ones(len(d)) if weight is None else np.asarray(weight, np.float64)
         w = w / w.sum()

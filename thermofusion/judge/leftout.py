@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ScanError
+from ..errors import ScanError, counted
 from ..mapping.observe import Mapped
 from ..physics.band import ZERO_DEGC_K
 from ..physics.emissivity import EmissivityModel
@@ -59,7 +59,9 @@ class Bench:
         rows = mapped.observations
         views = len(np.unique(rows.view))
         if views < 3:
-            raise ScanError(f"{views} thermal views see the surface: too few to leave any out", place=scan.root)
+            raise ScanError(
+                f"only {counted(views, 'thermal view')} of the surface: too few to leave any out", place=scan.root
+            )
         mesh = surface.mesh
         sections = recipe.mapping, recipe.temperature
         problem = ThermalProblem.of(scan, mesh, surface.normal_window_m, mapped, *sections)

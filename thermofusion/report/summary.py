@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..errors import counted
 from ..export.palettes import beyond_range
 from ..geometry.rigid import invert, rotation_angle_deg
 from ..recipe import Recipe
@@ -76,7 +77,9 @@ def summary(report: Mapping[str, Any], out: Path | None) -> str:
         lines.append(f"rig          {_rig_line(r['rig'])}")
     if "mapping" in r:
         left = ", ".join(f"{n} ({why})" for why, n in r["mapping"]["left_out"].items() if n)
-        lines.append(f"thermal      {count(r['mapping']['used'], 'frame')} used{f'; left out: {left}' if left else ''}")
+        lines.append(
+            f"thermal      {counted(r['mapping']['used'], 'frame')} used{f'; left out: {left}' if left else ''}"
+        )
     if "temperature" in r:
         lines += _temperature_lines(r["temperature"])
     lines += [f"note         {m}" for m in r["messages"]]
@@ -86,16 +89,11 @@ def summary(report: Mapping[str, Any], out: Path | None) -> str:
     return "\n".join(lines)
 
 
-def count(n: int, noun: str) -> str:
-    """A number and its noun: 1 frame, 2 frames."""
-    return f"{n:,} {noun}" if n == 1 else f"{n:,} {noun}s"
-
-
 def _path(t: Mapping[str, Any]) -> str:
     found = "as recorded" if t["source"] == "recorded" else "estimated from the depth frames"
     if t["tracked"] == t["frames"]:
-        return f"{found}: {count(t['frames'], 'frame')}"
-    return f"{found}: {t['tracked']} of {count(t['frames'], 'frame')}; the others are left out"
+        return f"{found}: {counted(t['frames'], 'frame')}"
+    return f"{found}: {t['tracked']} of {counted(t['frames'], 'frame')}; the others are left out"
 
 
 def _rig_line(a: Mapping[str, Any]) -> str:

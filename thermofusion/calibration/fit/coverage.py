@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...errors import counted
 from ...types import Float
 from .rig import Calibration
 
@@ -69,5 +70,6 @@ def advice(c: Coverage) -> list[str]:
             "record some nearer and farther, over the distances you will scan at"
         )
     if len(c.tilts_deg) < ENOUGH_VIEWS:
-        out.append(f"{len(c.tilts_deg)} views by the {c.camera} camera: {ENOUGH_VIEWS} to 30 make the numbers sure")
+        seen = counted(len(c.tilts_deg), "view")
+        out.append(f"{seen} by the {c.camera} camera: {ENOUGH_VIEWS} to 30 make the numbers sure")
     return out

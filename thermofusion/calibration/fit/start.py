@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ...errors import ScanError
+from ...errors import ScanError, counted
 from ...geometry.rigid import invert
 from ...types import Float
 from ..board.views import BoardPoints, CalibrationSet
@@ -22,7 +22,7 @@ def zhang(data: CalibrationSet, camera: str) -> tuple[Float, dict[str, Float]]:
     views = data.seen_by(camera)
     if len(views) < MIN_BOARD_VIEWS:
         raise ScanError(
-            f"the {camera} camera sees the board in {len(views)} views, {MIN_BOARD_VIEWS} are the least",
+            f"the {camera} camera sees the board in {counted(len(views), 'view')}, {MIN_BOARD_VIEWS} are the least",
             hint="record 15 to 30 views, tilted to all sides, all over the picture",
         )
     board = data.board.points_m.astype(np.float32)

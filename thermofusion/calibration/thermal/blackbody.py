@@ -24,6 +24,7 @@ from .source import ThermalSource
 
 CURVE_SCHEMA = "thermofusion-curve/1"
 BOX = ("left_px", "top_px", "width_px", "height_px")
+COLUMNS = "the columns must be counts,degC or file,degC"
 Opener = Callable[[Path], ThermalSource]
 
 
@@ -59,14 +60,14 @@ class Reading:
 def read_readings(path: Path) -> list[Reading]:
     """Rows `counts,degC`, or `file,degC` with paths beside the table and, if the source does not fill the picture,
     `left_px,top_px,width_px,height_px`. Raises ScanError naming the line."""
-    rows = list(table_rows(path, "readings", ["degC"]))
+    rows = list(table_rows(path, "readings", ["degC"], COLUMNS))
     if not rows:
         raise ScanError("there are no readings", place=path)
     columns = set(rows[0][1])
     if not columns & {"counts", "file"}:
-        raise ScanError("the columns must be counts,degC or file,degC", place=path)
+        raise ScanError("no column says where the readings were taken", place=path, hint=COLUMNS)
     if 0 < len(columns & set(BOX)) < 4:
-        raise ScanError(f"column(s) {', '.join(sorted(set(BOX) - columns))} are missing", place=path)
+        raise ScanError(f"a box needs {', '.join(BOX)}", place=path)
     return [_reading(row, path, f"{path}, line {n}") for n, row in rows]
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.special import ndtr
 
-from ...errors import ScanError
+from ...errors import ScanError, counted
 from ...robust import SIGMA_PER_MAD, mad_sigma
 from ...types import Float
 
@@ -60,7 +60,9 @@ def still_noise(frames_degC: Iterable[NDArray], times_s: NDArray) -> StillNoise:
         coarse.append(_blocks(x, side))
     mean, t = np.array(means), np.asarray(times_s, np.float64)
     if len(mean) < MIN_STILL_FRAMES:
-        raise ScanError(f"{len(mean)} frames are too few for noise and drift", hint="record a still scene for a minute")
+        raise ScanError(
+            f"{counted(len(mean), 'frame')}: too few for noise and drift", hint="record a still scene for a minute"
+        )
     if not (np.isfinite(t).all() and (np.diff(t) > 0).all()):
         raise ScanError("the frames state no rising times", hint="give --rate, in frames a second")
     d = np.diff(np.array(some) - mean[:, None], axis=0)  # differences: slow pixel drift falls out

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import ScanError
+from ...errors import ScanError, counted
 from ...files.reading import decode_image, open_regular, parse_json, read_head
 from ...geometry.rigid import invert, pose
 from ...types import Camera, Float, Scan, Stream
@@ -77,7 +77,7 @@ def read(path: Path) -> Scan:
         )
         lost += lost_color
     if lost:
-        notes.append(f"{lost} empty frames, or frames whose time repeats, left out")
+        notes.append(f"{counted(lost, 'frame')} left out: empty, or of a time that repeats")
     serial = recording.tags.get("K4A_DEVICE_SERIAL_NUMBER")
     return Scan(
         name=path.stem,

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import ScanError
+from ...errors import ScanError, counted
 from ...files.pnm import read_pnm
 from ...files.reading import inside, read_bytes, read_head, text_lines
 from ...geometry.rigid import pose
@@ -111,7 +111,7 @@ def read(path: Path, constants: KinectDepth = KinectDepth()) -> Scan:
         notes=(
             "depth in mm by typical constants of a Kinect v1 (the device's own are not in the recording)",
             f"nominal cameras assumed (depth f = {f:.1f} px, colour f = 525 px, 25 mm apart): a rig.json replaces them",
-            *([f"{dropped} depth frames with a repeated or earlier time left out"] if dropped else []),
+            *([f"{counted(dropped, 'depth frame')} with a repeated or earlier time left out"] if dropped else []),
             *_gravity(path, [entries[i] for i in rows["a"]]),
         ),
     )

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import ScanError
+from ...errors import ScanError, counted
 from ...files.reading import is_named, read_numbers
 from ...files.tum import poses_to_trajectory
 from ...geometry.rigid import pose
@@ -52,7 +52,7 @@ def read(path: Path) -> Scan:
         notes.append("colour is not calibrated here: nominal Kinect colour camera, 25 mm beside depth, assumed")
     trajectory, lost = _poses(path, numbers)
     if lost:
-        notes.append(f"{lost} frames have no finite pose")
+        notes.append(f"{counted(lost, 'frame')} without a finite pose")
     return Scan(
         name=path.resolve().name,
         root=path,

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import ScanError
+from ...errors import ScanError, counted
 from ...files.reading import MAX_FILE_BYTES, decode_image, read_bytes, read_head
 from ...physics.band import ZERO_DEGC_K
 from ...types import Scan, SignalCurve
@@ -115,7 +115,7 @@ def read(path: Path) -> Scan:
     frames = read_thermal_frames(path)
     n, h, w = frames.images.shape
     raise ScanError(
-        f"a thermal recording alone ({n} frames of {w} x {h} px), no depth to put it on",
+        f"a thermal recording alone ({counted(n, 'frame')} of {w} x {h} px), no depth to put it on",
         place=path,
         hint=f"`thermofusion import RECORDING -o SCAN --thermal {shlex.quote(str(path))} --rig rig.json` joins them",
     )
