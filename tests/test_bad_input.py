@@ -384,7 +384,11 @@ def test_foreign_faults(tmp_path):
     cases = {
         "take.mkv": (b"\x1a\x45\xdf\xa3" + b"\0" * 40, None, "no DEPTH track"),
         "take.bag": (b"#ROSBAG V2.0\n" + b"\0" * 4000, None, "Open3D cannot read"),
-        "shot.jpg": (cv2.imencode(".jpg", np.zeros((8, 8)))[1].tobytes(), "flir", "no FLIR radiometric data"),
+        "shot.jpg": (
+            cv2.imencode(".jpg", np.zeros((8, 8)))[1].tobytes(),
+            "flir",
+            "an ordinary picture: no temperatures",
+        ),
         "walk.seq": (b"FFF\0" + b"\0" * 60, None, "truncated"),
         "plain.bin": (b"hello", "azure-mkv", "no Matroska"),
         "other.bin": (b"hello", "realsense-bag", "no ROS bag"),

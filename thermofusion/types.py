@@ -301,6 +301,7 @@ class Scan:
     recorded_at: str | None = None
     subject: dict[str, object] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  # what the reader had to assume, or kept without understanding
+    times_assumed: bool = False  # no clock was recorded: frames stand at a nominal rate, and speeds mean nothing
 
     def __repr__(self) -> str:
         streams = {n: s for n in ("depth", "color", "thermal") if (s := getattr(self, n)) is not None}

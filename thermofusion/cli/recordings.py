@@ -2,49 +2,89 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ..errors import RecipeError
-from .console import emit, progress
+from ..errors import RecipeError, ScanError
+from .bundles import bundled
+from .console import emit, note, progress
+
+if TYPE_CHECKING:
+    from ..scans.thermal import ThermalFrames, ThermalSaid
+    from ..types import Scan, SignalCurve
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Force = Annotated[bool, typer.Option("--overwrite", help="Replace an existing scan folder.")]
 
 
+@dataclass(frozen=True)
+class DepthOptions:
+    """What a person says of the depth recording."""
+
+    format: Annotated[str | None, typer.Option(help="Format of the recording; recognised by default.")] = None
+    rig: Annotated[Path | None, typer.Option(help="rig.json with the cameras; with --thermal: its thermal camera.")] = (
+        None
+    )
+    depth_unit: Annotated[float | None, typer.Option(help="Metres a step of the stored depth: 0.001 = mm.")] = None
+    size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT of depth images without a header.")] = None
+    mirrored: Annotated[bool, typer.Option("--mirrored", help="Depth and colour are as in a mirror.")] = False
+
+
+@dataclass(frozen=True)
+class ThermalOptions:
+    """Thermal frames recorded apart, and what a person says of them."""
+
+    thermal: Annotated[Path | None, typer.Option(help="Thermal file, or folder of them, to add.")] = None
+    times: Annotated[
+        Path | None, typer.Option(help="List of times in s, rows name,time_s: of --thermal's frames, else of depth's.")
+    ] = None
+    fps: Annotated[float | None, typer.Option(help="Thermal frames a second, where nothing states times.")] = None
+    clock_offset: Annotated[
+        str | None, typer.Option(help="Seconds added to thermal's times, or auto: found from what moves in both.")
+    ] = None
+    gain: Annotated[float | None, typer.Option(help="degC = gain * stored value + offset.")] = None
+    offset_degC: Annotated[float | None, typer.Option("--offset-degC", help="See --gain.")] = None
+    curve: Annotated[Path | None, typer.Option(help="JSON of a signal's curve (docs/scan-format.md).")] = None
+    band: Annotated[str | None, typer.Option(help="LOW-HIGH in um: the camera's wavelengths, 7.5-13.5.")] = None
+
+
 def register(app: typer.Typer) -> None:
     """Add this module's verbs."""
-    app.command("import")(import_)
+    app.command("import")(bundled(import_))
     app.command()(simulate)
 
 
 def import_(
     recording: Annotated[Path, typer.Argument(help="A foreign recording.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="Scan folder to write.")],
-    format: Annotated[str | None, typer.Option(help="Format of the recording; recognised by default.")] = None,
-    thermal: Annotated[Path | None, typer.Option(help="FLIR JPEG or SEQ file(s) to add as thermal frames.")] = None,
-    rig: Annotated[Path | None, typer.Option(help="rig.json with the cameras; needed with --thermal.")] = None,
+    depth: DepthOptions,
+    added: ThermalOptions,
     overwrite: Force = False,
     json: Json = False,
 ) -> None:
-    """Write a foreign recording in the native scan form."""
-    from ..scans import open_scan, with_rig, with_thermal
+    """Write a foreign recording in the native scan form, with thermal frames that were recorded apart."""
+    from ..scans import Stated, open_scan
     from ..scans.native.write import write_scan
-    from ..scans.thermal.flir import read_thermal_frames
 
-    scan = open_scan(recording, format=format)
-    if thermal is not None and rig is None:
+    if added.thermal is not None and depth.rig is None:
         raise RecipeError(
             "--thermal needs --rig: where the thermal camera sits",
             hint="`thermofusion calibrate PICTURES -o rig.json` writes one",
         )
-    if thermal is not None and rig is not None:
-        scan = with_thermal(scan, read_thermal_frames(thermal), rig)
-    elif rig is not None:
-        scan = with_rig(scan, rig)
+    if added.thermal is None and _said_of_thermal(added):
+        raise RecipeError(f"{_said_of_thermal(added)[0]} is for thermal frames: it needs --thermal")
+    stated = Stated(depth_unit_m=_positive(depth.depth_unit), size_px=_size(depth.size), mirrored=depth.mirrored)
+    if depth.rig is not None and added.thermal is None:
+        stated = stated.with_rig(depth.rig)  # beside thermal it is for the thermal camera alone
+    times = added.times if added.thermal is None else None
+    scan = open_scan(recording, format=depth.format, stated=stated, times=times)
+    if added.thermal is not None and depth.rig is not None:
+        scan = _join(scan, added, depth.rig)
     with progress(json) as step:
         write_scan(scan, out, overwrite=overwrite, progress=step)
     streams = {name: len(s) for name in ("depth", "color", "thermal") if (s := getattr(scan, name)) is not None}
@@ -54,6 +94,110 @@ def import_(
         f"wrote {out}: {counts} frames",
         json,
     )
+    for text in scan.notes:
+        note(text)
+
+
+def _said_of_thermal(o: ThermalOptions) -> list[str]:
+    given: dict[str, object] = {
+        "--fps": o.fps,
+        "--clock-offset": o.clock_offset,
+        "--gain": o.gain,
+        "--offset-degC": o.offset_degC,
+    }
+    given |= {"--curve": o.curve, "--band": o.band}
+    return [name for name, value in given.items() if value is not None]
+
+
+def _join(scan: Scan, o: ThermalOptions, rig: Path) -> Scan:
+    """The scan with the thermal frames on its clock."""
+    from ..scans import with_thermal
+    from ..scans.native.compose import thermal_camera
+    from ..scans.stated import times_of
+    from ..scans.thermal import read_thermal, with_times
+
+    assert o.thermal is not None
+    camera = thermal_camera(rig)
+    frames = read_thermal(o.thermal, _said(o, camera.signal), camera.lens.shape)
+    if o.times is not None:
+        frames = with_times(frames, times_of(o.times, frames.places, range(len(frames))))
+    elif o.fps is not None and (fps := _positive(o.fps, "--fps")):
+        frames = with_times(frames, [i / fps for i in range(len(frames))])
+    if o.clock_offset is None:
+        return with_thermal(scan, frames, rig, band_um=_band(o.band))
+    if o.clock_offset != "auto":
+        times = frames.times_s + _number("--clock-offset", o.clock_offset)
+        return with_thermal(scan, frames, rig, times_s=times, band_um=_band(o.band))
+    return _join_by_motion(scan, frames, rig, o)
+
+
+def _join_by_motion(scan: Scan, frames: ThermalFrames, rig: Path, o: ThermalOptions) -> Scan:
+    import numpy as np
+
+    from ..calibration.thermal.clocks import join_clocks
+    from ..scans import with_thermal
+    from ..scans.native.compose import thermal_camera
+
+    if not np.isfinite(frames.times_s).all():
+        hint = "give --fps or --times: the frames' own clock, whatever its zero"
+        raise ScanError("the thermal frames state no times", place=frames.places[0], hint=hint)
+    found = join_clocks(scan, frames, frames.times_s, thermal_camera(rig))
+    text = f"thermal's clock found from the motion: {found.offset_s:+.4f} s, drift {found.drift * 1e6:+.0f} ppm"
+    scan = replace(scan, notes=(*scan.notes, f"{text}, good to {found.sigma_s * 1e3:.1f} ms ({found.frames} frames)"))
+    times = found.on_depth_clock(frames.times_s)
+    inside = (times >= scan.depth.times_s[0] - 1) & (times <= scan.depth.times_s[-1] + 1)
+    return with_thermal(scan, frames.part(np.flatnonzero(inside)), rig, times_s=times[inside], band_um=_band(o.band))
+
+
+def _said(o: ThermalOptions, rigs: SignalCurve) -> ThermalSaid:
+    """What the options say of stored values; where they say nothing, the rig's curve of counts."""
+    from ..scans.thermal import ThermalSaid
+
+    if o.curve is not None and (o.gain is not None or o.offset_degC is not None):
+        raise RecipeError("--curve and --gain or --offset-degC say the same thing: give one")
+    if o.curve is None and o.gain is None and o.offset_degC is None and rigs.kind == "counts":
+        return ThermalSaid(curve=rigs)
+    return ThermalSaid(o.gain, o.offset_degC, None if o.curve is None else _curve(o.curve))
+
+
+def _curve(path: Path) -> SignalCurve:
+    from ..scans.native.schema import curve_of_file
+
+    return curve_of_file(path)
+
+
+def _size(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
+    if match is None or not int(match[1]) or not int(match[2]):
+        raise RecipeError(f"--size: expected WIDTHxHEIGHT, got '{text}'")
+    return int(match[1]), int(match[2])
+
+
+def _band(text: str | None) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    match = re.fullmatch(r"(\d+\.?\d*)-(\d+\.?\d*)", text)
+    if match is None or not 1 <= float(match[1]) < float(match[2]) <= 30:
+        raise RecipeError(f"--band: expected LOW-HIGH, rising wavelengths in 1-30 um, got '{text}'")
+    return float(match[1]), float(match[2])
+
+
+def _number(name: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not abs(value) < float("inf"):
+        raise RecipeError(f"{name}: expected seconds or auto, got '{text}'")
+    return value
+
+
+def _positive(value: float | None, name: str = "--depth-unit") -> float | None:
+    if value is not None and not 0 < value < float("inf"):
+        raise RecipeError(f"{name}: expected a number above 0, got {value}")
+    return value
 
 
 def simulate(

@@ -6,6 +6,7 @@ import io
 import json
 import math
 import os
+import re
 import stat
 import struct
 import zlib
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from ..errors import ScanError
 from ..types import Float
 from .pnm import read_pnm
+from .tiff import is_tiff, tiff_pages
 
 MAX_PIXELS = 64_000_000  # a header that claims more is refused before it is decoded
 MAX_FILE_BYTES = 512 * 2**20  # of one image or mesh
@@ -34,6 +36,8 @@ PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 COPY_AGAIN = "copy the recording again"
 # A pipe without a writer would block whoever opens it. Windows tells binary from text.
 _OPEN_FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+_COMMENT = re.compile(r"(?:^|\s)#")
+_NAN = re.compile(r"[-+]?(nan\w*(\(\w*\))?|1\.#\w+)", re.IGNORECASE)  # Microsoft's C library: -nan(ind), -1.#IND
 
 
 def inside(root: Path, name: str, *, place: object) -> Path:
@@ -223,13 +227,13 @@ def read_numbers(path: Path, *, columns: int | None = None) -> Float:
     """Rows of numbers (N, columns), blanks or commas between, `#` comments; ScanError names the line."""
     numbers, rows, width = array("d"), 0, columns or 0
     for number, line in enumerate(text_lines(path), 1):
-        words = line.split("#")[0].replace(",", " ").split()
+        words = _COMMENT.split(line)[0].replace(",", " ").split()
         if not words:
             continue
         place = f"{path}, line {number}"
         width, rows = width or len(words), rows + 1
         try:
-            numbers.extend(map(float, words))
+            numbers.extend(float("nan" if _NAN.fullmatch(w) else w) for w in words)
         except ValueError:
             raise ScanError("expected numbers only", place=place) from None
         if len(words) != width:
@@ -267,6 +271,8 @@ def decode_image(data: bytes, *, shape: tuple[int, int] | None, kind: str, place
         fault = "truncated (JPEG without its end)"
     if fault:
         raise ScanError(f"the {kind} file is {fault}", place=place, hint=COPY_AGAIN)
+    if is_tiff(data):
+        _check_tiff(data, kind, place)
     if data[:1] == b"P":
         return read_pnm(data, place=place)
     try:
@@ -280,6 +286,17 @@ def decode_image(data: bytes, *, shape: tuple[int, int] | None, kind: str, place
     return image
 
 
+def _check_tiff(data: bytes, kind: str, place: object) -> None:
+    """ScanError for what a decoder would do in silence: turn the image, or give the first page of many."""
+    pages = tiff_pages(data, 2)
+    if pages and pages[0].orientation != 1:
+        text = f"the {kind} TIFF says it is to be turned or mirrored (orientation {pages[0].orientation}, tag 274)"
+        raise ScanError(text, place=place, hint="write it as the camera's pixels lie, with orientation 1")
+    if len(pages) > 1:
+        hint = "write one file a frame (`thermofusion import --thermal` reads many pages)"
+        raise ScanError(f"the {kind} TIFF holds more than one page", place=place, hint=hint)
+
+
 def claimed_size(data: bytes, place: object = None) -> tuple[int, int] | None:
     """(width, height) an image's header claims; None if it is no PNG, JPEG, TIFF, PGM or PPM."""
     if data.startswith(PNG_MAGIC) and len(data) >= 24:
@@ -289,8 +306,8 @@ def claimed_size(data: bytes, place: object = None) -> tuple[int, int] | None:
         return _jpeg_size(data)
     if data[:2] in (b"P5", b"P6"):
         return read_pnm(data, place=place, header_only=True).shape[1::-1]
-    if data[:4] in (b"II*\0", b"MM\0*"):
-        return _tiff_size(data)
+    if is_tiff(data):
+        return next(((p.width_px, p.height_px) for p in tiff_pages(data, 1)), None)
     return None
 
 
@@ -307,22 +324,6 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
         else:
             at += 2 + struct.unpack(">H", data[at + 2 : at + 4])[0]
     return None
-
-
-def _tiff_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height from the first directory's tags 256 and 257 (TIFF 6.0)."""
-    e = "<" if data[:2] == b"II" else ">"
-    size = {}
-    try:
-        (at,) = struct.unpack_from(e + "I", data, 4)
-        (count,) = struct.unpack_from(e + "H", data, at)
-        for k in range(min(count, 512)):
-            tag, kind = struct.unpack_from(e + "HH", data, at + 2 + 12 * k)
-            if tag in (256, 257) and kind in (3, 4):
-                (size[tag],) = struct.unpack_from(e + ("H" if kind == 3 else "I"), data, at + 10 + 12 * k)
-    except struct.error:
-        return None
-    return (size[256], size[257]) if len(size) == 2 else None
 
 
 def _png_fault(data: bytes) -> str | None:

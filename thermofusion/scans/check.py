@@ -19,8 +19,9 @@ from ..geometry.rigid import rotation_angle_deg, transform_points
 from ..physics.band import ZERO_DEGC_K
 from ..physics.signal import SignalConverter
 from ..types import BlackbodyReference, Camera, Float, Scan, Stream, ThermalStream, UInt8
-from .overlay import OVERLAY_FRAMES, edge_overlays
+from .overlay import OVERLAY_FRAMES, edge_overlays, looks_mirrored
 from .pairing import nearest_in_time
+from .thermal.units import looks_like
 
 DEPTH_RANGE_M = (0.15, 9.0)  # a room's median depth lies inside, whatever the camera; outside, the unit is wrong
 CONSTANT_FROM, CONSTANT_SHARE = 100, 0.99  # measured pixels, and the share of equal ones, that no camera makes
@@ -217,6 +218,13 @@ def _thermal_faults(scan: Scan, sample: int) -> None:
         constant += _is_constant(degC)
         if not np.isfinite(degC).any():
             raise ScanError("the thermal frame has no measurement at all", place=scan.thermal.places[i])
+        unit = looks_like(degC if scan.thermal.camera.signal.kind == "counts" else scan.thermal.load(i))
+        if unit is not None and scan.thermal.camera.signal.kind != "radiance":
+            raise ScanError(
+                f"the thermal values look like {unit[0]}, not degrees Celsius",
+                place=scan.thermal.places[i],
+                hint=f"check cameras.thermal.signal, or import the images again with {unit[1]}",
+            )
         median = float(np.nanmedian(degC))
         if not APPARENT_RANGE_DEGC[0] <= median <= APPARENT_RANGE_DEGC[1]:
             raise ScanError(
@@ -294,6 +302,9 @@ def check_scan(scan: Scan, sample: int = 9) -> CheckReport:
     if not faults:
         figures = _measure(scan, sample)
         findings += _figure_findings(figures)
+        if looks_mirrored(scan):
+            text = "depth is mirrored, left to right: its edges fit the other cameras' pictures only turned round"
+            findings.append(Finding("warning", "mirror", f"{text}; import the recording with --mirrored"))
     if not any(f.severity == "error" for f in findings):
         findings.insert(0, Finding("ok", "scan", "every sampled frame decodes; units and times are plausible"))
     return CheckReport(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -128,16 +127,6 @@ def as_loaded(kind: Kind, raw: NDArray, place: object, unit_m: float, invalid: t
     if raw.ndim == 2:
         return cv2.cvtColor(raw, cv2.COLOR_GRAY2RGB)
     return cv2.cvtColor(raw, cv2.COLOR_BGRA2RGB if raw.shape[2] == 4 else cv2.COLOR_BGR2RGB)
-
-
-def numbered(files: Sequence[Path]) -> list[tuple[int, Path]]:
-    """Files with the last number in their names (`depth_12.png` -> 12), in its order; without one: by name."""
-    numbers = [re.findall(r"\d+", f.stem) for f in files]
-    if all(numbers):
-        pairs = sorted((int(n[-1][-18:]), f) for n, f in zip(numbers, files, strict=True))
-        if len({n for n, _ in pairs}) == len(pairs):
-            return pairs
-    return list(enumerate(sorted(files)))
 
 
 def image_size(path: Path, kind: str) -> tuple[int, int]:

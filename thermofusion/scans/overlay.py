@@ -17,6 +17,8 @@ from .pairing import nearest_in_time
 OVERLAY_FRAMES = 3  # spread through the recording
 EDGE_STEP = 0.03  # a neighbour farther away by this share of the range makes an edge
 REACH_PX = 12  # shifts tried
+MIRROR_FRAMES, MOST, FEW = 7, 0.6, 0.3  # frames looked at; share that must fit turned round, may fit as they stand
+FITS_PX, FITS_CONTRAST = 4.0, 1.25  # an overlay that fits: its best shift, its contrast
 _GREEN = (0, 255, 0)  # sRGB: no grey, no skin
 
 
@@ -55,6 +57,25 @@ def edge_overlays(scan: Scan, count: int = OVERLAY_FRAMES) -> list[Overlay]:
             picture = _upright(_draw(grey if name == "thermal" else stream.load(i), edges), T[:3, :3] @ scan.depth_up)
             found.append(Overlay(f"overlay-{name}-{int(stream.index[i]):06d}", name, picture, shift, contrast))
     return found
+
+
+def looks_mirrored(scan: Scan) -> bool:
+    """Whether depth edges fit the other cameras' images only once depth and colour are turned round, left to right.
+
+    Raises ScanError for a bad frame.
+    """
+    from .stated import unmirrored
+
+    as_is, turned = edge_overlays(scan, MIRROR_FRAMES), edge_overlays(unmirrored(scan), MIRROR_FRAMES)
+    for camera in {o.camera for o in as_is}:
+        fit, other = (np.mean([_fits(o) for o in found if o.camera == camera]) for found in (as_is, turned))
+        if other >= MOST and fit <= FEW and sum(o.camera == camera for o in turned) >= 3:
+            return True
+    return False
+
+
+def _fits(overlay: Overlay) -> bool:
+    return bool(np.abs(overlay.shift_px).max() <= FITS_PX and overlay.contrast >= FITS_CONTRAST)
 
 
 def _others(scan: Scan) -> Iterator[tuple[str, Stream, Camera, Float, Float]]:

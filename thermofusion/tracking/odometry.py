@@ -57,7 +57,7 @@ def odometry(
         progress("track", n, len(indices))
         if frame.empty:
             continue
-        if not (segments and segments[-1].take(frame)):
+        if not (segments and segments[-1].take(frame, timed=not frames.scan.times_assumed)):
             segments.append(GrowingSegment(frame, frames.intrinsics, tracking))
     return [s.finished() for s in segments]
 
@@ -81,15 +81,15 @@ class GrowingSegment:
         self._velocity = np.zeros(6)  # twist per second
         self._append(frame, np.eye(4) if T is None else T, None, np.eye(4))
 
-    def take(self, frame: TrackingFrame) -> bool:
-        """Append a frame if the motion to it can be believed."""
+    def take(self, frame: TrackingFrame, *, timed: bool = True) -> bool:
+        """Append a frame if the motion to it can be believed; timed : its time was recorded, so its speed counts."""
         if frame.index - self._frames[-1] > MAX_GAP_FRAMES:
             return False
         dt_s, last = max(frame.time_s - self._last.time_s, 1e-3), [(self._last.map, np.eye(4))]
         for start, reaches in ((se3_exp(self._velocity * dt_s), REACHES_M), (np.eye(4), RESCUE_REACHES_M)):
             T_last_now, _ = register_view(frame.map, last, start, reaches, tolerance=STEP_TOLERANCE)
             partners = find_partners(frame.map, self._last.map, T_last_now, REACH_M)
-            believed = _believed(partners, self._tracking) and _possible(T_last_now, dt_s)
+            believed = _believed(partners, self._tracking) and (not timed or _possible(T_last_now, dt_s))
             if believed and agreement(frame.map, self._last.map, T_last_now, stride=2) >= MIN_AGREEMENT:
                 self._append(frame, self._T[-1] @ T_last_now, partners, T_last_now)
                 self._velocity = se3_log(T_last_now) / dt_s

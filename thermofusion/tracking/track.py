@@ -25,6 +25,7 @@ from .fragments import Fragment
 from .frames import TrackingFrames
 from .joint import LOOP_APART, overlapping, solve_jointly
 from .odometry import GrowingSegment, Segment, odometry
+from .recorded import believed
 from .registration import register_view
 from .relocalise import find_join
 
@@ -80,26 +81,31 @@ def locate(
     tracking: TrackingSection,
     progress: Progress = silent,
 ) -> TrackingResult:
-    """Where the depth camera was: the recorded trajectory as it is, or refined, or estimated from the depth alone.
+    """Where the depth camera was: the recorded trajectory, or it refined, or estimated from the depth alone.
 
+    A recorded trajectory is held against the depth first (`recorded.believed`); QualityError where it cannot be right.
     Raises ScanError if a recorded trajectory is asked for and there is none, or no frame shows the subject.
     """
     if tracking.source == "recorded" and scan.trajectory is None:
         raise ScanError("no trajectory was recorded", place=scan.root, hint="set tracking.source to auto or estimate")
-    if scan.trajectory is not None and tracking.source != "estimate" and not tracking.refine:
-        return recorded(scan)
-    if tracking.source == "estimate":
+    if scan.trajectory is None or tracking.source == "estimate":
         scan = replace(scan, trajectory=None)
-    return track(scan, input=input, subject=subject, tracking=tracking, progress=progress)
+        return track(scan, input=input, subject=subject, tracking=tracking, progress=progress)
+    trajectory, messages = believed(scan)
+    scan = replace(scan, trajectory=trajectory)
+    if not tracking.refine:
+        return recorded(scan, messages)
+    result = track(scan, input=input, subject=subject, tracking=tracking, progress=progress)
+    return replace(result, messages=(*messages, *result.messages))
 
 
-def recorded(scan: Scan) -> TrackingResult:
+def recorded(scan: Scan, messages: tuple[str, ...] = ()) -> TrackingResult:
     """The recorded trajectory as it is. Depth frames outside it count as not tracked."""
     assert scan.trajectory is not None
     n = len(scan.depth)
     _, inside = interpolate_trajectory(scan.trajectory, scan.depth.times_s)
     nan = np.full(n, np.nan)
-    return TrackingResult(scan.trajectory, inside, nan, nan, (), 0, True, None, "recorded", ())
+    return TrackingResult(scan.trajectory, inside, nan, nan, (), 0, True, None, "recorded", messages)
 
 
 def track(

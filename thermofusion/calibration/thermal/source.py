@@ -14,8 +14,8 @@ from ...files.reading import read_bytes, read_image
 from ...physics.band import ZERO_DEGC_K
 from ...physics.signal import MAX_UNUSABLE, counts_to_kelvin
 from ...scans import FORMATS, open_scan
-from ...scans.thermal.flir import read_thermal_frames
-from ...scans.thermal.flir import recognise as is_flir
+from ...scans.thermal import read_thermal
+from ...scans.thermal import recognise as is_radiometric
 from ...types import Float, Scan, SignalCurve
 from .radiometric import RadiometricCurve
 
@@ -131,10 +131,9 @@ def open_thermal(path: Path, *, raw: RawLayout | None = None, rate_hz: float | N
 
 
 def _open(path: Path, raw: RawLayout | None) -> ThermalSource:
-    if is_flir(path):
-        frames = read_thermal_frames(path)
-        images = frames.images
-        return ThermalSource(frames.places, frames.times_s, lambda i: images[i], frames.signal)
+    if is_radiometric(path):
+        frames = read_thermal(path)
+        return ThermalSource(frames.places, frames.times_s, frames.load, frames.signal)
     if any(f.recognise(path) for f in FORMATS):
         scan = open_scan(path)
         if scan.thermal is None:

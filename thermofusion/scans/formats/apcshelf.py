@@ -16,7 +16,9 @@ from ...errors import ScanError
 from ...files.reading import decode_image, text_lines
 from ...files.tum import poses_to_trajectory
 from ...types import Float, Scan
-from ..common import ImageFiles, frame_times, image_size, image_stream, make_camera, make_rig, numbered
+from ..common import ImageFiles, frame_times, image_size, image_stream, make_camera, make_rig
+from ..naming import in_order, real_files
+from ..stated import NOTHING, Stated
 
 UNIT_M = 1e-4  # the recorder's unit of depth, 0.1 mm
 # Found by predicting registered from raw depth (tests/test_scans.py): without the extrinsic's 4.3 mm along z the two
@@ -29,25 +31,25 @@ def recognise(path: Path) -> bool:
     return (path / "cam.info.txt").is_file() and next(path.glob("frame-*.depth.png"), None) is not None
 
 
-def read(path: Path) -> Scan:
+def read(path: Path, stated: Stated = NOTHING) -> Scan:
     """The scan of the raw depth camera where `raw/` is there, of registered depth otherwise."""
-    return read_shelf(path, registered=not (path / "raw").is_dir())
+    return read_shelf(path, registered=not (path / "raw").is_dir(), unit_m=stated.unit_m(UNIT_M))
 
 
-def read_shelf(path: Path, *, registered: bool) -> Scan:
+def read_shelf(path: Path, *, registered: bool, unit_m: float = UNIT_M) -> Scan:
     """`registered`: depth as shipped in the colour camera's pixels; else the raw depth camera with its extrinsic."""
     info = _info(path / "cam.info.txt")
     T_color_depth = np.eye(4) if registered else _entry(info, "depth-to-color", path, (4, 4))
     K_color = _entry(info, "color camera intrinsic", path, (3, 3))
     K_depth = K_color if registered else _entry(info, "depth camera intrinsic", path, (3, 3))
 
-    depth = numbered(list((path if registered else path / "raw").glob("frame-*.depth.png")))
-    color = numbered(list(path.glob("frame-*.color.png")))
-    if not depth or not color:
+    depth = in_order(real_files((path if registered else path / "raw").glob("frame-*.depth.png")))
+    color = in_order(real_files(path.glob("frame-*.color.png")))
+    if not depth.files or not color.files:
         raise ScanError("there are no frame-NNNNNN.depth.png or .color.png", place=path)
-    depth_camera = make_camera(*image_size(depth[0][1], "depth"), K_depth, place=path / "cam.info.txt")
-    color_camera = make_camera(*image_size(color[0][1], "color"), K_color, place=path / "cam.info.txt")
-    numbers, color_numbers = [n for n, _ in depth], [n for n, _ in color]
+    depth_camera = make_camera(*image_size(depth.files[0], "depth"), K_depth, place=path / "cam.info.txt")
+    color_camera = make_camera(*image_size(color.files[0], "color"), K_color, place=path / "cam.info.txt")
+    numbers = depth.index
     T_world_color = np.stack([_entry(info, f"frame-{n:06d}", path, (4, 4)) for n in numbers])
     return Scan(
         name=path.resolve().name,
@@ -55,16 +57,15 @@ def read_shelf(path: Path, *, registered: bool) -> Scan:
         format="apc-shelf",
         rig=make_rig(depth_camera, color_camera, T_color_depth, place=path / "cam.info.txt"),
         depth=image_stream(
-            ImageFiles("depth", [f for _, f in depth], frame_times(numbers), path, numbers),
+            ImageFiles("depth", depth.files, frame_times(numbers), path, numbers),
             depth_camera,
-            unit_m=UNIT_M,
+            unit_m=unit_m,
             decode=decode_depth,
         ),
-        color=image_stream(
-            ImageFiles("color", [f for _, f in color], frame_times(color_numbers), path, color_numbers), color_camera
-        ),
+        color=image_stream(ImageFiles("color", color.files, frame_times(color.index), path, color.index), color_camera),
         trajectory=poses_to_trajectory(frame_times(numbers), T_world_color @ T_color_depth, place=path),
-        depth_unit_m=UNIT_M,
+        depth_unit_m=unit_m,
+        times_assumed=True,
         notes=(
             "the recording carries no times: 30 frames a second by number are assumed",
             *([NOT_MOVED] if registered else []),

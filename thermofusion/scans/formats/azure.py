@@ -21,6 +21,7 @@ from ...files.reading import decode_image, open_regular, parse_json, read_head
 from ...geometry.rigid import invert, pose
 from ...types import Camera, Float, Scan, Stream
 from ..common import Kind, as_loaded, make_camera, make_rig, make_stream
+from ..stated import NOTHING, Stated
 from . import ebml
 
 # Image size -> (size of the whole calibrated image, rows and columns cut off before the image), by camera.
@@ -46,7 +47,7 @@ def recognise(path: Path) -> bool:
     return path.suffix.lower() == ".mkv" and read_head(path, 4) == b"\x1a\x45\xdf\xa3"
 
 
-def read(path: Path) -> Scan:
+def read(path: Path, stated: Stated = NOTHING) -> Scan:
     """An Azure Kinect recording as a scan. The file stays mapped in memory; frames are decoded when asked for."""
     data = _map(path)
     recording = ebml.parse(data, path)
@@ -67,8 +68,8 @@ def read(path: Path) -> Scan:
     if color_track is not None:
         color_camera, T_color = azure_camera(calibration, "color", color_track.width_px, color_track.height_px, path)
         T_color_depth = T_color @ invert(T_depth)
-    shape = depth_camera.shape
-    depth, lost = _stream(data, recording, depth_track, "depth", path, lambda b, p: decode_b16g(b, shape, p))
+    shape, unit_m = depth_camera.shape, stated.unit_m(0.001)
+    depth, lost = _stream(data, recording, depth_track, "depth", path, lambda b, p: decode_b16g(b, shape, p), unit_m)
     color = None
     if color_track is not None and color_camera is not None:
         size = color_camera.shape
@@ -86,6 +87,7 @@ def read(path: Path) -> Scan:
         rig=make_rig(depth_camera, color_camera, T_color_depth, place=f"{path}: calibration.json"),
         depth=depth,
         color=color,
+        depth_unit_m=unit_m,
         notes=(*notes, *([f"device serial number {serial}"] if serial else [])),
     )
 
@@ -154,6 +156,7 @@ def _stream(
     kind: Kind,
     path: Path,
     decode: Callable[[bytes, object], NDArray],
+    unit_m: float = 0.001,
 ) -> tuple[Stream, int]:
     """The track's frames in time order, and how many were left out."""
     all_frames = sorted((f for f in recording.frames if f.track == track.number), key=lambda f: f.time_ns)
@@ -164,7 +167,7 @@ def _stream(
 
     def load(i: int) -> NDArray:
         f = frames[i]
-        return as_loaded(kind, decode(bytes(data[f.offset : f.offset + f.length]), places[i]), places[i], 0.001)
+        return as_loaded(kind, decode(bytes(data[f.offset : f.offset + f.length]), places[i]), places[i], unit_m)
 
     times_s = [f.time_ns * 1e-9 for f in frames]
     return make_stream(times_s, load, places, place=path, kind=kind), len(all_frames) - len(frames)

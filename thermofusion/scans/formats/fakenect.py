@@ -22,6 +22,7 @@ from ...files.reading import inside, read_bytes, read_head, text_lines
 from ...geometry.rigid import pose
 from ...types import Float, Scan
 from ..common import ImageFiles, image_stream, make_camera, make_rig
+from ..stated import NOTHING, Stated
 
 TICK_HZ = 60e6  # of the Kinect's clock
 TICK_WRAP = 2**32  # ticks: the counter has 32 bits, 72 s
@@ -76,7 +77,7 @@ def recognise(path: Path) -> bool:
     return re.search(rb"^d-[\d.]+-\d+\.pgm", read_head(path / "INDEX.txt", 65536), re.MULTILINE) is not None
 
 
-def read(path: Path, constants: KinectDepth = KinectDepth()) -> Scan:
+def read(path: Path, stated: Stated = NOTHING, constants: KinectDepth = KinectDepth()) -> Scan:
     """A fakenect folder as a scan: depth in whole millimetres by `constants`, nominal cameras."""
     entries = _entries(path)
     times = unwrap_ticks(np.array([e.wall_s for e in entries]), np.array([e.ticks for e in entries]))
@@ -85,11 +86,12 @@ def read(path: Path, constants: KinectDepth = KinectDepth()) -> Scan:
         raise ScanError("no depth frames are listed", place=path / "INDEX.txt")
     f = constants.focal_px
     depth_camera = make_camera(640, 480, np.array([[f, 0, 319.5], [0, f, 239.5], [0, 0, 1]]), place=path)
-    table = constants.table_mm()
+    table, unit_m = constants.table_mm(), stated.unit_m(0.001)
     depth_rows = _in_time(rows["d"], times)
     depth = image_stream(
         ImageFiles("depth", [entries[i].file for i in depth_rows], times[depth_rows], path / "INDEX.txt"),
         depth_camera,
+        unit_m=unit_m,
         decode=lambda data, place: decode_depth(data, place, table),
     )
     color, color_camera = None, None
@@ -107,6 +109,7 @@ def read(path: Path, constants: KinectDepth = KinectDepth()) -> Scan:
         rig=make_rig(depth_camera, color_camera, T_color_depth if color_camera else None, place=path),
         depth=depth,
         color=color,
+        depth_unit_m=unit_m,
         recorded_at=_date(entries[0].wall_s),
         notes=(
             "depth in mm by typical constants of a Kinect v1 (the device's own are not in the recording)",

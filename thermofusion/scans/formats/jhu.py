@@ -16,7 +16,9 @@ from scipy.spatial.transform import Rotation
 from ...errors import ScanError
 from ...geometry.rigid import pose
 from ...types import Camera, Float, Scan, SignalCurve, Stream, ThermalCamera, ThermalStream, Trajectory
-from ..common import ImageFiles, as_thermal, frame_times, image_stream, make_camera, make_rig, numbered
+from ..common import ImageFiles, as_thermal, frame_times, image_stream, make_camera, make_rig
+from ..naming import in_order, real_files
+from ..stated import NOTHING, Stated
 
 THERMAL_SHAPE = (476, 632)  # (height, width), px: files have no header
 FAR_CLIP_MM = 3975  # the recorder's far clip: no measurement
@@ -55,7 +57,7 @@ def recognise(path: Path) -> bool:
     return bool(_depth_files(path))
 
 
-def read(path: Path, *, depth_to_color_x_m: float = -0.025) -> Scan:
+def read(path: Path, stated: Stated = NOTHING, *, depth_to_color_x_m: float = -0.025) -> Scan:
     """Such a folder as a scan; one frame stands at the origin, several have no poses.
 
     Frames without colour are taken as of the face's session (its own rig), with colour as of the boards'.
@@ -68,8 +70,8 @@ def read(path: Path, *, depth_to_color_x_m: float = -0.025) -> Scan:
     if not files:
         raise ScanError("there is no NAME.pgm with NAME_0000.raw", place=path)
     root = path if path.is_dir() else path.parent
-    frames = numbered(files)
-    numbers, depth_files = [n for n, _ in frames], [f for _, f in frames]
+    frames, unit_m = in_order(files), stated.unit_m(0.001)
+    numbers, depth_files = list(frames.index), list(frames.files)
     times = frame_times(numbers)
     face = not any(f.with_suffix(".jpg").is_file() for f in depth_files)
     f = FACE_FOCAL_PX if face else DEPTH_FOCAL_PX
@@ -82,11 +84,16 @@ def read(path: Path, *, depth_to_color_x_m: float = -0.025) -> Scan:
         format="jhu",
         rig=make_rig(depth_camera, color_camera, None if face else T_color_depth, place=path),
         depth=image_stream(
-            ImageFiles("depth", depth_files, times, path, numbers), depth_camera, invalid=(0, FAR_CLIP_MM)
+            ImageFiles("depth", depth_files, times, path, numbers),
+            depth_camera,
+            unit_m=unit_m,
+            invalid=(0, FAR_CLIP_MM),
         ),
         color=None if color_camera is None else _color(depth_files, times, numbers, color_camera, path),
         thermal=_thermal(depth_files, times, numbers, T_color_depth, path),
         trajectory=Trajectory(times, np.eye(4)[None]) if len(files) == 1 else None,
+        depth_unit_m=unit_m,
+        times_assumed=True,
         notes=(
             "cameras refitted from the authors' picks (colour to thermal 3.4 px rms: the rig was moved between groups)",
             f"depth f = {f:.0f} px, its origin {depth_to_color_x_m * 1e3:+.0f} mm along colour's x: not calibrated",
@@ -131,5 +138,5 @@ def decode_counts(data: bytes, place: object) -> NDArray[np.uint16]:
 
 
 def _depth_files(path: Path) -> list[Path]:
-    candidates = sorted(path.glob("*.pgm")) if path.is_dir() else [path] if path.suffix == ".pgm" else []
+    candidates = sorted(real_files(path.glob("*.pgm"))) if path.is_dir() else [path] if path.suffix == ".pgm" else []
     return [f for f in candidates if f.with_name(f"{f.stem}_0000.raw").is_file()]

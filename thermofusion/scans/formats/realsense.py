@@ -20,6 +20,7 @@ from ...errors import ScanError
 from ...files.reading import read_head, read_image
 from ...types import Scan
 from ..common import Kind, as_loaded, make_camera, make_rig, make_stream
+from ..stated import NOTHING, Stated
 
 MAGIC = b"#ROSBAG V2.0"
 
@@ -29,7 +30,7 @@ def recognise(path: Path) -> bool:
     return read_head(path, len(MAGIC)) == MAGIC
 
 
-def read(path: Path) -> Scan:
+def read(path: Path, stated: Stated = NOTHING) -> Scan:
     """A .bag as a scan. Raises ScanError where Open3D cannot play it, or where it holds no frames."""
     if not recognise(path):
         raise ScanError("it is no ROS bag", place=path)
@@ -38,7 +39,7 @@ def read(path: Path) -> Scan:
         spool = _play(reader, path)
         m = reader.metadata
         camera = make_camera(int(m.width), int(m.height), np.array(m.intrinsics.intrinsic_matrix), place=path)
-        unit_m = 1.0 / float(m.depth_scale)
+        unit_m = stated.unit_m(1.0 / float(m.depth_scale))
     finally:
         reader.close()
     places = [f"{path}, frame {i}" for i in range(len(spool.times_s))]

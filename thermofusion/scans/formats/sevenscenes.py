@@ -15,7 +15,9 @@ from ...files.reading import is_named, read_numbers
 from ...files.tum import poses_to_trajectory
 from ...geometry.rigid import pose
 from ...types import Scan, Trajectory
-from ..common import ImageFiles, frame_times, image_size, image_stream, make_camera, make_rig, numbered
+from ..common import ImageFiles, frame_times, image_size, image_stream, make_camera, make_rig
+from ..naming import Named, in_order, real_files
+from ..stated import NOTHING, Stated
 
 INVALID = (0, 65535)  # raw depths that mean none
 PUBLISHED_K = np.array([[585.0, 0, 320], [0, 585.0, 240], [0, 0, 1]])
@@ -29,25 +31,25 @@ def recognise(path: Path) -> bool:
     return path.is_dir() and next(path.glob("frame-*.depth.png"), None) is not None
 
 
-def read(path: Path) -> Scan:
+def read(path: Path, stated: Stated = NOTHING) -> Scan:
     """Such a folder as a scan, with its poses; frames whose pose is not finite (tracking lost) go without one."""
     depth = _frames(path, "depth")
-    if not depth:
+    if not depth.files:
         raise ScanError("there are no frame-NNNNNN.depth.png", place=path)
-    numbers, files = [n for n, _ in depth], [f for _, f in depth]
+    numbers, files = depth.index, depth.files
     width, height = image_size(files[0], "depth")
     own = path / "camera-intrinsics.txt"
     K = read_numbers(own, columns=3) if is_named(own) else PUBLISHED_K
-    camera = make_camera(width, height, K, place=own if is_named(own) else path)
+    camera = stated.camera("depth") or make_camera(width, height, K, place=own if is_named(own) else path)
+    unit_m = stated.unit_m(0.001)
     notes = ["the recording carries no times: 30 frames a second by number are assumed"]
     color_camera, color = None, None
     color_frames = _frames(path, "color")
-    if color_frames:
-        color_camera = make_camera(*image_size(color_frames[0][1], "color"), COLOR_K, place=path)
-        color_numbers = [n for n, _ in color_frames]
-        pictures = [f for _, f in color_frames]
+    if color_frames.files:
+        pictures, size = color_frames.files, image_size(color_frames.files[0], "color")
+        color_camera = stated.camera("color") or make_camera(*size, COLOR_K, place=path)
         color = image_stream(
-            ImageFiles("color", pictures, frame_times(color_numbers), path, color_numbers), color_camera
+            ImageFiles("color", pictures, frame_times(color_frames.index), path, color_frames.index), color_camera
         )
         notes.append("colour is not calibrated here: nominal Kinect colour camera, 25 mm beside depth, assumed")
     trajectory, lost = _poses(path, numbers)
@@ -58,18 +60,22 @@ def read(path: Path) -> Scan:
         root=path,
         format="7-scenes",
         rig=make_rig(camera, color_camera, T_COLOR_DEPTH if color_camera is not None else None, place=path),
-        depth=image_stream(ImageFiles("depth", files, frame_times(numbers), path, numbers), camera, invalid=INVALID),
+        depth=image_stream(
+            ImageFiles("depth", files, frame_times(numbers), path, numbers), camera, unit_m=unit_m, invalid=INVALID
+        ),
         color=color,
         trajectory=trajectory,
+        depth_unit_m=unit_m,
         notes=tuple(notes),
+        times_assumed=True,
     )
 
 
-def _frames(path: Path, kind: str) -> list[tuple[int, Path]]:
-    return numbered([f for s in ("png", "jpg") for f in path.glob(f"frame-*.{kind}.{s}")])
+def _frames(path: Path, kind: str) -> Named:
+    return in_order(real_files(f for s in ("png", "jpg") for f in path.glob(f"frame-*.{kind}.{s}")))
 
 
-def _poses(path: Path, numbers: list[int]) -> tuple[Trajectory | None, int]:
+def _poses(path: Path, numbers: tuple[int, ...]) -> tuple[Trajectory | None, int]:
     kept, poses, lost = [], [], 0
     for n in numbers:
         file = path / f"frame-{n:06d}.pose.txt"

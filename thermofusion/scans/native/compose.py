@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,29 +11,12 @@ from numpy.typing import NDArray
 from ...errors import ScanError
 from ...files.reading import read_json
 from ...files.strict import validated
-from ...types import Camera, Scan, SignalCurve, ThermalStream
+from ...types import Camera, Float, Scan, ThermalCamera, ThermalStream
 from ..common import as_thermal, make_rig, make_stream
+from ..thermal.frames import ThermalFrames
 from .schema import CameraDoc, DepthCorrectionDoc, RigDoc, camera_of, matrix_of, thermal_camera_of
 
 CORRECTED_UNIT_M = 0.00025  # rounding to a millimetre would undo a correction of that size; 16 bits reach 16 m
-
-
-@dataclass(frozen=True, eq=False)
-class ThermalFrames:
-    """A recording of a thermal camera alone.
-
-    images : (N, H, W) as stored (uint16 counts or float32). times_s : (N,) the camera's own clock, NaN = not stated.
-    places : where each came from. signal : how a count becomes an apparent blackbody temperature.
-    degC : (N, H, W) float32, the temperature by the file's own emissivity, distance and room; for comparison only.
-    notes : what had to be assumed.
-    """
-
-    images: NDArray
-    times_s: NDArray[np.float64]
-    places: tuple[str, ...]
-    signal: SignalCurve
-    degC: NDArray[np.float32] | None = None
-    notes: tuple[str, ...] = ()
 
 
 def with_rig(scan: Scan, path: str | Path) -> Scan:
@@ -107,35 +90,79 @@ def _depth_corrected(scan: Scan, doc: DepthCorrectionDoc, path: Path) -> Scan:
     return replace(scan, depth=depth, depth_unit_m=unit_m, notes=(*scan.notes, f"depth corrected by {path.name}"))
 
 
+def thermal_camera(rig: str | Path) -> ThermalCamera:
+    """The thermal camera of a rig.json. Raises ScanError if it has none, or not its place."""
+    return _thermal_camera(Path(rig))[0]
+
+
+def _thermal_camera(path: Path) -> tuple[ThermalCamera, bool]:
+    """The thermal camera of a rig.json, and whether the file tells its signal."""
+    doc = validated(RigDoc, read_json(path), path)
+    if doc.cameras.thermal is None or doc.extrinsics.T_thermal_depth is None:
+        raise ScanError("'cameras.thermal' and 'extrinsics.T_thermal_depth' are needed to join thermal", place=path)
+    return thermal_camera_of(doc.cameras.thermal, doc.extrinsics, path), doc.cameras.thermal.signal is not None
+
+
 def with_thermal(
-    scan: Scan, frames: ThermalFrames, rig: str | Path, *, times_s: NDArray[np.float64] | None = None
+    scan: Scan,
+    frames: ThermalFrames,
+    rig: str | Path,
+    *,
+    times_s: NDArray[np.float64] | None = None,
+    band_um: tuple[float, float] | None = None,
 ) -> Scan:
     """A depth recording joined to thermal frames recorded apart, by a rig.json that has the thermal camera.
 
     times_s : (N,) of the thermal frames on the depth clock, where the files' own clock is another or is not stated.
+    band_um : of the camera, where it is not the rig's.
 
-    The stored counts and their own curve go into the scan, so the temperature stays apparent; emissivity and
-    reflection are the fusion's business. Raises ScanError: the rig lacks the thermal camera or T_thermal_depth, its
-    size differs from the frames', a frame has no time.
+    The stored values go into the scan with their own curve, or the rig's where the files have none, so the temperature
+    stays apparent; emissivity and reflection are the fusion's business. What the camera was told of the room fills what
+    the scan does not state of it. Raises ScanError: the rig lacks the thermal camera or T_thermal_depth, its size
+    differs from the frames', a frame has no time, or none within the depth recording's time.
     """
     path = Path(rig)
-    doc = validated(RigDoc, read_json(path), path)
-    if doc.cameras.thermal is None or doc.extrinsics.T_thermal_depth is None:
-        raise ScanError("'cameras.thermal' and 'extrinsics.T_thermal_depth' are needed to join thermal", place=path)
-    camera = replace(thermal_camera_of(doc.cameras.thermal, doc.extrinsics, path), signal=frames.signal)
-    if frames.images.shape[1:] != camera.lens.shape:
-        (h, w), lens = frames.images.shape[1:], camera.lens
+    if scan.times_assumed:
+        text = "depth carries no times, so thermal frames have no place among them"
+        hint = "give them: `thermofusion import DEPTH --times LIST -o SCAN`, then join thermal to SCAN"
+        raise ScanError(text, place=scan.root, hint=hint)
+    camera, tells_signal = _thermal_camera(path)
+    if frames.signal is None and not tells_signal:
+        hint = "give --gain and --offset-degC, --curve, or a rig.json with cameras.thermal.signal"
+        raise ScanError(
+            "the thermal frames hold counts, and nobody says their curve", place=frames.places[0], hint=hint
+        )
+    camera = replace(camera, signal=frames.signal or camera.signal, band_um=band_um or camera.band_um)
+    if frames.shape != camera.lens.shape:
+        (h, w), lens = frames.shape, camera.lens
         raise ScanError(
             f"the thermal frames are {w} x {h} px, the rig says {lens.width_px} x {lens.height_px}", place=path
         )
     times = frames.times_s if times_s is None else np.asarray(times_s, np.float64)
     if not np.isfinite(times).all():
-        raise ScanError(
-            "the thermal frames state no times",
-            place=frames.places[0],
-            hint="record a SEQ file, or JPEGs that state their time",
+        text, hint = "the thermal frames state no times", "give --times or --fps, and --clock-offset"
+        raise ScanError(text, place=frames.places[0], hint=hint)
+    if times_s is not None:
+        camera = replace(camera, time_offset_s=0.0)
+    stream = make_stream(times, frames.load, frames.places, place=frames.places[0], kind="thermal")
+    _check_common_time(scan, times + camera.time_offset_s, frames.places[0])
+    own, told = scan.environment, frames.environment
+    room = {k: getattr(told, k) for k, v in vars(own).items() if v is None and getattr(told, k) is not None}
+    notes = [*scan.notes, *frames.notes, f"thermal frames joined by {path.name}"]
+    if room:
+        said = ", ".join(f"{k} {v:g}" for k, v in room.items())
+        notes.append(f"environment as the thermal camera was told, set it if you know better: {said}")
+    return replace(scan, thermal=as_thermal(stream, camera), environment=replace(own, **room), notes=tuple(notes))
+
+
+def _check_common_time(scan: Scan, times_s: Float, place: object) -> None:
+    """ScanError where no thermal frame lies within the depth recording's time: two clocks."""
+    t = scan.depth.times_s
+    if times_s[-1] < t[0] or times_s[0] > t[-1]:
+        text = (
+            f"thermal ({times_s[0]:.3f} to {times_s[-1]:.3f} s) and depth ({t[0]:.3f} to {t[-1]:.3f} s) have no time in"
         )
-    images = frames.images
-    stream = make_stream(times, lambda i: images[i], frames.places, place=frames.places[0], kind="thermal")
-    notes = (*scan.notes, *frames.notes, f"thermal frames joined by {path.name}")
-    return replace(scan, thermal=as_thermal(stream, camera), notes=notes)
+        hint = (
+            "give --clock-offset SECONDS (added to thermal's times), or --clock-offset auto to find it from the motion"
+        )
+        raise ScanError(f"{text} common: two clocks", place=place, hint=hint)

@@ -68,6 +68,7 @@ def read_native(root: Path) -> Scan:
         recorded_at=doc.recorded_at,
         subject=doc.subject,
         notes=(*doc.notes, *notes),
+        times_assumed=doc.times_assumed,
     )
 
 

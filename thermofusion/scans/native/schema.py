@@ -10,7 +10,8 @@ import numpy as np
 from pydantic import BaseModel, Field, field_validator
 
 from ...errors import ScanError
-from ...files.strict import Border
+from ...files.reading import read_json
+from ...files.strict import Border, validated
 from ...types import BlackbodyReference, Camera, ContactReference, Reference, Rig, SignalCurve, ThermalCamera
 from ..common import Kind, make_camera, make_rig
 
@@ -81,7 +82,7 @@ class ThermalCameraDoc(CameraDoc):
     signal: SignalDoc
     band_um: tuple[float, float] = (7.5, 13.5)
     netd_K: float = Field(0.05, ge=0.0001, le=5)
-    time_offset_s: float = Field(0.0, ge=-3600, le=3600)
+    time_offset_s: float = Field(0.0, ge=-1e11, le=1e11)  # s: clocks may begin anywhere
     psf_sigma_px: float | None = Field(None, ge=0.01, le=20)
 
 
@@ -150,6 +151,7 @@ class ScanDoc(Border):
     )
     subject: dict[str, Any] = Field(default_factory=dict)
     notes: list[str] = Field(default_factory=list)
+    times_assumed: bool = False
 
 
 class RigThermalDoc(ThermalCameraDoc):
@@ -256,6 +258,15 @@ def _signal(doc: SignalDoc, path: Path) -> SignalCurve:
     if doc.curve is None:
         raise ScanError("key 'cameras.thermal.signal.curve' is needed for counts", place=path)
     return SignalCurve("counts", doc.curve.type, _curve_parameters(doc.curve, path))
+
+
+def curve_of_file(path: Path) -> SignalCurve:
+    """A curve of counts from a JSON file: the `curve` group, or a `signal` group, of scan.json. Raises ScanError."""
+    tree = read_json(path)
+    if isinstance(tree, dict) and "kind" in tree:
+        return _signal(validated(SignalDoc, tree, path), path)
+    doc = validated(CurveDoc, tree, path)
+    return SignalCurve("counts", doc.type, _curve_parameters(doc, path))
 
 
 def _curve_parameters(doc: CurveDoc, path: Path) -> dict[str, tuple[float, ...]]:

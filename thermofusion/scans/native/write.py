@@ -78,6 +78,7 @@ def scan_json(scan: Scan) -> dict[str, Any]:
         "references": [_reference(r) for r in scan.references],
         "subject": scan.subject,
         **({"notes": list(scan.notes)} if scan.notes else {}),
+        **({"times_assumed": True} if scan.times_assumed else {}),
     }
 
 

@@ -1,0 +1,1 @@
+"""Recordings of robots' and sensors' own programs: bags, dumps, streams."""
