@@ -17,7 +17,8 @@ def table_rows(
     """(number of its last line, cells by column) of every row; cells are trimmed, absent ones empty.
 
     kind : what the file is, for messages. needed : columns that must be there, or else `hint` is given. Raises
-    ScanError: no such columns, a column twice, a row of more cells than columns or of more than `MAX_LINE` characters, and what `text_lines` raises.
+    ScanError: no such columns, a column twice, a row of more cells than columns or of more than `MAX_LINE` characters,
+    and what `text_lines` raises.
     """
     lines = _Lines(path, kind)
     reader = csv.reader(lines, skipinitialspace=True, strict=False)
