@@ -141,7 +141,7 @@ def test_microsofts_nan_is_a_lost_pose(tmp_path):
     put(root / "frame-000001.pose.txt", "-nan(ind)\t-1.#IND\tnan\t1.#QNAN\n" * 4)
     scan = open_scan(root)
     assert len(scan.trajectory) == 2
-    assert any("1 frames have no finite pose" in n for n in scan.notes)
+    assert any("1 frame without a finite pose" in n for n in scan.notes)
 
 
 def test_colour_of_another_size_has_a_camera_of_its_own_or_stays_out(tmp_path):

@@ -35,10 +35,19 @@ def read_trajectory(path: Path) -> Trajectory:
     bad = np.flatnonzero(np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1) > UNIT_TOLERANCE)
     if len(bad):
         raise ScanError("the quaternion's length is not 1", place=f"{path}, pose {bad[0] + 1}")
+    return poses_to_trajectory(rows[:, 0], poses_of(rows[:, 1:]), place=path)
+
+
+def poses_of(rows: Float) -> Float:
+    """Poses (N, 4, 4) [m] of rows (N, 7) `tx ty tz qx qy qz qw`. Raises ValueError for a quaternion of length 0."""
     T = np.tile(np.eye(4), (len(rows), 1, 1))
-    T[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
-    T[:, :3, 3] = rows[:, 1:4]
-    return poses_to_trajectory(rows[:, 0], T, place=path)
+    T[:, :3, :3], T[:, :3, 3] = Rotation.from_quat(rows[:, 3:]).as_matrix(), rows[:, :3]
+    return T
+
+
+def rows_of(T: Float) -> Float:
+    """Inverse of `poses_of`, with qw >= 0: rows (N, 7) of poses (N, 4, 4) [m]."""
+    return np.column_stack([T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_quat(canonical=True)])
 
 
 def write_trajectory(path: str | Path, trajectory: Trajectory, *, exact: bool = False, note: str = "") -> Path:
@@ -47,9 +56,7 @@ def write_trajectory(path: str | Path, trajectory: Trajectory, *, exact: bool = 
     exact : digits enough to read the same numbers back; else microseconds and nanometres. note : a line of comment.
     Raises ResourceError.
     """
-    T = trajectory.T_world_depth
-    q = Rotation.from_matrix(T[:, :3, :3]).as_quat(canonical=True)
-    rows = np.column_stack([trajectory.times_s, T[:, :3, 3], q]).tolist()
+    rows = np.column_stack([trajectory.times_s, rows_of(trajectory.T_world_depth)]).tolist()
     if exact:
         lines = [" ".join(map(repr, row)) for row in rows]
     else:

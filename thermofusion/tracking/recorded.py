@@ -12,10 +12,10 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from ..depth.filter import read_ahead
 from ..errors import QualityError
+from ..files.tum import poses_of, rows_of
 from ..geometry.rigid import interpolate_trajectory, invert, rotation_angle_deg, transform_points
 from ..types import Camera, Float, Float32, Scan, Trajectory
 
@@ -58,8 +58,7 @@ class Reading:
         """Poses (N, 4, 4) T_world_depth [m] of poses that were read as ours."""
         out = T.copy()
         if self.w_first:
-            q = Rotation.from_matrix(T[:, :3, :3]).as_quat()
-            out[:, :3, :3] = Rotation.from_quat(q[:, [1, 2, 3, 0]]).as_matrix()
+            out = poses_of(rows_of(T)[:, [0, 1, 2, 4, 5, 6, 3]])
         out[:, :3, 3] *= self.unit_m
         return (invert(out) if self.inverse else out) @ self.axes
 

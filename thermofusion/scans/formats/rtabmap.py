@@ -14,11 +14,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from ...errors import ScanError
 from ...files.reading import decode_image, open_regular, read_numbers, read_text
-from ...files.tum import poses_to_trajectory
+from ...files.tum import poses_of, poses_to_trajectory
 from ...geometry.rigid import pose
 from ...types import Camera, Float, Scan, Trajectory
 from ..common import make_camera, make_rig, make_stream
@@ -190,7 +189,5 @@ def _export_poses(path: Path, name: str, T_body_camera: Float) -> Trajectory | N
                 raise ScanError(
                     "expected rows `time x y z qx qy qz qw id` (rtabmap-export --poses_format 11)", place=file
                 )
-            T = np.tile(np.eye(4), (len(table), 1, 1))
-            T[:, :3, :3], T[:, :3, 3] = Rotation.from_quat(table[:, 4:8]).as_matrix(), table[:, 1:4]
-            return poses_to_trajectory(table[:, 0], T @ local, place=file)
+            return poses_to_trajectory(table[:, 0], poses_of(table[:, 1:8]) @ local, place=file)
     return None

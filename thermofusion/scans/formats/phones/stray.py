@@ -12,11 +12,10 @@ from threading import Lock
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from ....errors import ScanError
 from ....files.reading import read_image, read_numbers, read_text
-from ....files.tum import poses_to_trajectory
+from ....files.tum import poses_of, poses_to_trajectory
 from ....types import Camera, Float, Scan, Stream
 from ...common import make_camera, make_rig, make_stream
 from ...naming import images_in, in_order
@@ -71,12 +70,9 @@ def _odometry(path: Path) -> tuple[Float, Float]:
     lines = [w for line in read_text(path).splitlines()[1:] if (w := line.replace(",", " ").split())]
     try:
         table = np.array([[float(x) for x in w[:9]] for w in lines], np.float64).reshape(len(lines), 9)
-        rotation = Rotation.from_quat(table[:, 5:9]).as_matrix()
+        return table[:, 0], poses_of(table[:, 2:])
     except ValueError:
         raise ScanError("expected rows `timestamp, frame, x, y, z, qx, qy, qz, qw`", place=path) from None
-    T = np.tile(np.eye(4), (len(table), 1, 1))
-    T[:, :3, :3], T[:, :3, 3] = rotation, table[:, 2:5]
-    return table[:, 0], T
 
 
 def _open(video: Path) -> cv2.VideoCapture:
