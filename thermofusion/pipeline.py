@@ -34,7 +34,7 @@ STAGES = (
     Stage("surface", ("input", "subject", "surface")),
     Stage("rig", ("input", "rig")),
     Stage("mapping", ("input", "mapping")),
-    Stage("temperature", ("mapping", "temperature")),
+    Stage("temperature", ("mapping", "temperature"), edition=2),
 )
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
 

@@ -218,6 +218,7 @@ class OutputSection(_Section):
         ["ply", "glb", "vtp"], description="files of the mesh (docs/formats.md)"
     )
     views: bool = Field(True, description="views/*.png")
+    report: bool = Field(True, description="report.html: the result to look at and to measure in, one file")
     compare_methods: bool = Field(False, description="how every other method's temperatures differ, in result.json")
     palette: Literal["inferno", "iron", "grey", "cividis", "rainbow"] = Field(
         "inferno", description="colours of pictures and meshes; rainbow shows edges that are not in the data"

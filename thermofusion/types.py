@@ -407,6 +407,29 @@ class VertexFlag(IntFlag):
     MOVED = 32  # the subject moved between views
 
 
+@dataclass(frozen=True, eq=False)
+class SharedErrors:
+    """What the errors of many vertices have in common: a mean over them does not average it away.
+
+    names : what each of R independent causes is. effect : (V, R) int8, what one sigma of a cause does to a vertex,
+    signed, in steps of step_K (R,); 0 where unmeasured. focal_px : of the thermal camera: a pixel's size on the skin.
+    normal_window_m : diameter over which the normals' errors are one.
+    """
+
+    names: tuple[str, ...]
+    effect: NDArray[np.int8]
+    step_K: Float32
+    focal_px: float
+    normal_window_m: float
+
+    @classmethod
+    def of(cls, effects_K: dict[str, NDArray], focal_px: float, normal_window_m: float) -> SharedErrors:
+        """From the effects (V,) of each cause, K, by name; NaN = unmeasured."""
+        columns = np.nan_to_num(np.stack(list(effects_K.values()), axis=1)).astype(np.float32)
+        step = np.maximum(np.abs(columns).max(axis=0, initial=0) / np.float32(127), np.float32(1e-9))
+        return cls(tuple(effects_K), np.round(columns / step).astype(np.int8), step, focal_px, normal_window_m)
+
+
 OutputMode = Literal["absolute", "normal-equivalent", "apparent"]
 
 

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from ..files.json import to_json
 from .console import emit, help_alone, note
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
@@ -37,9 +38,13 @@ def check(
     format: Annotated[str | None, typer.Option(help="Format of the recording; recognised by default.")] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder for overlay pictures.")] = None,
     rig: Annotated[Path | None, typer.Option(help="Overlay this rig.json instead of the scan's own.")] = None,
+    template: Annotated[
+        bool, typer.Option("--template", help="Print a metadata.json to fill in and to put beside the recording.")
+    ] = False,
     json: Json = False,
 ) -> int:
     """Streams, sync, units, extrinsics, overlay pictures, missing metadata of a recording."""
+    from ..report.metadata import template as to_fill_in
     from ..report.pictures import write_png
     from ..scans import open_scan, with_rig
     from ..scans.check import check_scan, overlays
@@ -47,6 +52,10 @@ def check(
     recording = open_scan(scan, format=format)
     if rig is not None:
         recording = with_rig(recording, rig)
+    if template:
+        document = to_fill_in(recording)
+        emit(document, to_json(document), json)
+        return 0
     report = check_scan(recording)
     pictures = []
     if out is not None:

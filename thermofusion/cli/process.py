@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ..errors import QualityError
+from ..errors import QualityError, RecipeError
 from .console import emit, named, note, progress
 from .options import Drawing, Json, Processing, Recording, spelled_out
+
+if TYPE_CHECKING:
+    from ..report.html import Reported
 
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what stands in the result folder.")]
 STAGES = "tracking, surface, rig, mapping, temperature"  # pipeline.STAGE_NAMES, which --help has no time to load
@@ -66,34 +69,58 @@ def demo(
     with progress(json) as step:
         result = pipeline.fuse(scan, load_recipe("torso"), out=named(out), progress=step, overwrite=overwrite)
     emit(result.report, pipeline.summary(result.report, out), json)
-    note(f"look at {out / 'views' / 'overview.png'}; open {out / 'mesh.glb'} in Blender, {out / 'mesh.ply'} in MeshLab")
+    note(f"open the report in a browser, {out / 'mesh.glb'} in Blender, {out / 'mesh.ply'} in MeshLab")
     return QualityError.exit_code if result.report["quality"]["failed"] else 0
 
 
 def export(
     result: Annotated[Path, typer.Argument(help="A result folder.")],
     drawing: Drawing,
-    formats: Annotated[str, typer.Option("--format", help="Comma-separated: ply, glb, vtp, csv.")] = "ply,glb,vtp",
+    formats: Annotated[
+        str, typer.Option("--format", help="Comma-separated: ply, glb, vtp, csv, obj, stl, vtk-mesh, dicom.")
+    ] = "ply,glb,vtp",
     show: Annotated[str, typer.Option(help="absolute, normal-equivalent or apparent.")] = "absolute",
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder; the result's own by default.")] = None,
+    regions: Annotated[Path | None, typer.Option("--regions", help="dicom: regions JSON for its SR.")] = None,
+    deidentify: Annotated[
+        bool, typer.Option("--deidentify", help="Without colour, face, names, dates and free text; needs -o.")
+    ] = False,
     json: Json = False,
 ) -> None:
-    """Write a result's mesh and pictures again: other formats, palette, range, size, or output mode."""
+    """Write a result's mesh and pictures again: other formats, palette, range, size, or output mode; as DICOM."""
     from .. import pipeline
     from ..export import export as write
     from ..export.palettes import beyond_range
     from ..report.pictures import write_views
 
     palette, limits = drawing.palette, drawing.range_degC
-    mesh = pipeline.load_mesh(result, show)
+    if deidentify and out is None:
+        raise RecipeError("--deidentify needs -o: a folder of its own, apart from the files that tell who it is")
     folder = result if out is None else named(out)
+    wanted = [f.strip() for f in formats.split(",")]
+    dicom = "dicom" in wanted
+    reported = _reported(result, regions, deidentify) if dicom or deidentify else None
+    mesh = pipeline.load_mesh(result, show) if reported is None else reported.temperature.shown(show)
     mode = "" if show == "absolute" else f"-{show}"  # other modes never replace the corrected mesh and its pictures
-    wanted = tuple(f.strip() for f in formats.split(","))
-    written = write(mesh, folder, wanted, palette=palette, range_degC=limits, name=f"mesh{mode}")
+    meshes = [f for f in wanted if f != "dicom"]
+    written = write(mesh, folder, meshes, palette=palette, range_degC=limits, name=f"mesh{mode}")
     written += write_views(mesh, folder / f"views{mode}", palette=palette, range_degC=limits, height_px=drawing.size)
+    if dicom and reported is not None:
+        from ..handover.dicom import write_study
+
+        written += write_study(folder / "dicom", reported)
     if folder.resolve() == result.resolve():
         pipeline.add_files(result, written)
     outside = "" if limits is None else beyond_range(mesh.temperature_degC, *limits)
     if outside:
         note(f"note: {outside}")
     emit({"written": written}, "\n".join(f"wrote {path}" for path in written), json)
+
+
+def _reported(result: Path, regions: Path | None, deidentify: bool) -> Reported:
+    from ..regions import read_regions
+    from ..report.deidentify import deidentified
+    from ..results.folder import report_of
+
+    reported = report_of(result, [] if regions is None else read_regions(regions))
+    return deidentified(reported) if deidentify else reported

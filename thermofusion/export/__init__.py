@@ -16,11 +16,13 @@ from .axes import axes_of, view_axes
 from .csv import read_csv, write_csv
 from .glb import read_glb, write_glb
 from .ply import read_ply, write_ply
+from .solid import closed, write_closed, write_obj, write_stl
 from .vtp import read_vtp, write_vtp
 
 __all__ = [
     "MeshFormat",
     "axes_of",
+    "closed",
     "export",
     "read_csv",
     "read_glb",
@@ -37,11 +39,15 @@ __all__ = [
     "write_vtp",
 ]
 
-MeshFormat = Literal["ply", "glb", "vtp", "csv"]
+MeshFormat = Literal["ply", "glb", "vtp", "csv", "obj", "stl", "vtk-mesh"]
+FILES = {"vtk-mesh": "mesh-closed.vtp"}  # of formats whose file is not mesh.<format>
 _COLORED: dict[str, Callable[[Path, ThermalMesh, str, tuple[float, float] | None], Path]] = {
     "ply": write_ply,
     "glb": write_glb,
     "vtp": write_vtp,
+    "obj": write_obj,
+    "stl": write_stl,
+    "vtk-mesh": write_closed,
 }
 _READERS: dict[str, Callable[[Path], ThermalMesh]] = {".ply": read_ply, ".glb": read_glb, ".vtp": read_vtp}
 
@@ -55,7 +61,7 @@ def export(
     range_degC: tuple[float, float] | None = None,
     name: str = "mesh",
 ) -> list[Path]:
-    """Write `<name>.<format>` for each format into a folder that is made if need be.
+    """Write `<name>.<format>` for each format (`<name>-closed.vtp` for vtk-mesh) into a folder, made if need be.
 
     Raises RecipeError for an unknown format, palette or range, ValueError for a broken mesh, ResourceError for the
     disk. Every file is whole or absent.
@@ -70,7 +76,7 @@ def export(
         raise ResourceError(f"the folder cannot be made ({e.strerror})", place=folder) from None
     written = []
     for form in wanted:
-        path = folder / f"{name}.{form}"
+        path = folder / FILES.get(form, "{}.{}").format(name, form)
         written.append(write_csv(path, mesh) if form == "csv" else _COLORED[form](path, mesh, palette, range_degC))
     return written
 

@@ -59,6 +59,13 @@ def vertex_areas(vertices: Float32, triangles: Int) -> Float:
     return vertex_sums(np.linalg.norm(triangle_normals(vertices, triangles), axis=1) / 6, triangles, len(vertices))
 
 
+def enclosed_volume(vertices: NDArray, triangles: NDArray) -> float:
+    """Volume, m³, inside a closed surface of vertices (V, 3) m and outward triangles (F, 3): Σ a·(b x c)/6."""
+    centred = vertices.astype(np.float64) - vertices.mean(axis=0, dtype=np.float64)
+    a, b, c = (centred[triangles[:, k]] for k in range(3))
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+
+
 def components(triangles: Int, count: int) -> Int:
     """(V,) number of the connected piece each vertex belongs to."""
     along = (triangles[:, :2].ravel(), triangles[:, 1:].ravel())  # two sides of a triangle connect its three corners

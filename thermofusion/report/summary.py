@@ -15,6 +15,7 @@ from ..geometry.rigid import invert, rotation_angle_deg
 from ..recipe import Recipe
 from ..types import Scan, VertexFlag
 from ..version import __version__
+from .metadata import radiometric_numbers, stated
 
 if TYPE_CHECKING:
     from ..mapping.observe import Mapped
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from ..temperature.solve import Temperature
     from ..tracking.track import TrackingResult
 
+PAGE = "report.html"  # in a result's folder
 PERCENTILES = (1, 5, 50, 95, 99)
 
 
@@ -61,10 +63,26 @@ def result_report(scan: Scan, recipe: Recipe, steps: Steps, reused: Sequence[str
     if steps.temperature is not None and recipe.output.range_degC is not None:
         out = beyond_range(steps.temperature.mesh.temperature_degC, *recipe.output.range_degC)
         messages += [f"{out}: `thermofusion export RESULT` draws them again in colours that fit"] if out else []
+    if scan.thermal is not None:
+        report["radiometry"] = radiometric_numbers(scan, recipe.temperature)
+        report["band_um"] = scan.thermal.camera.band_um
+    report["metadata"] = stated(scan, _answered(recipe, steps))
     report["quality"] = _quality(recipe, scan, steps)
     report["messages"] = messages
     report["stages_reused"] = list(reused)
     return report
+
+
+def _answered(recipe: Recipe, steps: Steps) -> dict[str, str]:
+    """What the result itself says of how it was recorded."""
+    emissivity = recipe.temperature.emissivity
+    known = {"recording.emissivity": f"{emissivity.model}, corrected with the viewing angle"}
+    if steps.temperature is not None and steps.temperature.mesh.measured.any():
+        mesh = steps.temperature.mesh
+        near, far = np.nanpercentile(mesh.distance_m, (5, 95))
+        known["recording.distance"] = f"{near:.2f} to {far:.2f} m from the skin"
+        known["recording.angle"] = f"best view of each spot: median {np.nanmedian(mesh.view_angle_deg):.0f}°"
+    return known
 
 
 def summary(report: Mapping[str, Any], out: Path | None) -> str:
@@ -86,6 +104,8 @@ def summary(report: Mapping[str, Any], out: Path | None) -> str:
     lines += [f"BELOW GATE   {m}" for m in r["quality"]["failed"]]
     if out is not None:
         lines.append(f"written to   {out}")
+        if (out / PAGE).is_file():
+            lines.append(f"look at      {out / PAGE}")
     return "\n".join(lines)
 
 

@@ -6,25 +6,32 @@ import shlex
 from collections.abc import Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
+from hashlib import sha256
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import RecipeError, ScanError
 from ..files.json import to_json
-from ..files.reading import read_json
+from ..files.reading import read_image, read_json, read_whole
 from ..files.whole import changing_over, write_text
-from ..recipe import Recipe
+from ..mapping.observe import Mapped
+from ..recipe import Recipe, load_recipe
+from ..regions import Measured, Measurer, Region
 from ..report.casts import DOUBTS
 from ..report.casts import VIEWS as FACES
-from ..report.summary import Steps, result_report
+from ..report.html import Reported, report_html, write_report
+from ..report.summary import PAGE, Steps, result_report
 from ..types import Scan, ThermalMesh, Trajectory
 from ..version import __version__
 from .artifacts import load_artifact, save_artifact
 from .claim import CHANGING, REPORT, VIEWS, listed
 from .frame import WORLD, Frame, frame_of
+from .stages import WORK
 
 if TYPE_CHECKING:
     from ..report.casts import Cast
+    from ..temperature.solve import Temperature
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +71,18 @@ class Result(Steps):
         trajectory = self.tracking.trajectory
         return trajectory if self.frame is None else self.frame.trajectory(trajectory)
 
+    def measure(self, *regions: Region) -> Measured:
+        """What regions of interest read, left against right (docs/report.md). Raises RecipeError as `mesh`."""
+        return Measured.of(Measurer(self.mesh, None if self.temperature is None else self.temperature.shared), regions)
+
+    def _repr_html_(self) -> str:
+        """The report, small, for notebooks."""
+        if self.temperature is None:
+            return "<p>The run was stopped before the temperature stage.</p>"
+        shown = replace(self.temperature, mesh=self.mesh)
+        page = escape(report_html(Reported(shown, self.report, Recipe(), self.mapped)))
+        return f'<iframe srcdoc="{page}" width="100%" height="640" sandbox="allow-scripts allow-downloads"></iframe>'
+
     @property
     def mesh(self) -> ThermalMesh:
         """The surface with its temperatures, upright. Raises RecipeError if the run stopped before there were any."""
@@ -82,7 +101,7 @@ class Result(Steps):
 def names_of(recipe: Recipe) -> list[str]:
     """The files that a finished run writes, but for its stages."""
     names = ["recipe.resolved.toml", "trajectory.txt", "result.npz", REPORT]
-    names += [f"mesh.{f}" for f in recipe.output.formats]
+    names += [f"mesh.{f}" for f in recipe.output.formats] + [PAGE] * recipe.output.report
     return [*names, *(f"{VIEWS}/{v}.png" for v in (*FACES, "overview", *DOUBTS) if recipe.output.views)]
 
 
@@ -112,6 +131,11 @@ def write_result(
                 write_views(
                     result.mesh_in_world, new / VIEWS, palette=output.palette, range_degC=range_degC, casts=cast
                 )
+            if output.report:
+                shown = replace(result.temperature, mesh=mesh)
+                reported = Reported(shown, result.report, recipe, result.mapped, hashes=hashes_of(new))
+                overview = new / VIEWS / "overview.png"
+                write_report(new / PAGE, reported, read_image(overview)[..., ::-1] if overview.is_file() else None)
         files = sorted(p.relative_to(new).as_posix() for p in new.rglob("*") if p.is_file())
         write_text(new / REPORT, to_json({**result.report, "files": [*files, REPORT]}))
         write_text(folder / CHANGING, to_json(sorted({*left, *files, REPORT})))
@@ -130,8 +154,29 @@ def add_files(folder: Path, paths: Sequence[Path]) -> None:
     write_text(folder / REPORT, to_json(report))
 
 
+def report_of(folder: Path, regions: Sequence[Region] = ()) -> Reported:
+    """What a finished result's report is made of. Raises ScanError, RecipeError."""
+    temperature, stored = load_temperature(folder), folder / WORK / "mapping.npz"
+    report = read_json(folder / REPORT)
+    recipe = load_recipe(folder / "recipe.resolved.toml")
+    mapped = load_artifact(stored) if stored.is_file() else None
+    known = isinstance(mapped, Mapped) and mapped.observations.vertex.max(initial=-1) < len(temperature.mesh)
+    return Reported(temperature, report, recipe, mapped if known else None, regions, hashes_of(folder))
+
+
+def hashes_of(folder: Path) -> dict[str, str]:
+    """SHA-256 of the files that hold a result, by name."""
+    names = (*(f"mesh.{suffix}" for suffix in ("ply", "glb", "vtp", "csv")), "result.npz", "recipe.resolved.toml")
+    return {n: sha256(read_whole(folder / n)).hexdigest() for n in names if (folder / n).is_file()}
+
+
 def load_mesh(folder: Path, show: str = "absolute") -> ThermalMesh:
     """The mesh of a finished result, in one of the three output modes. Raises ScanError."""
+    return load_temperature(folder).shown(show)
+
+
+def load_temperature(folder: Path) -> Temperature:
+    """The temperatures of a finished result. Raises ScanError."""
     from ..temperature.solve import Temperature
 
     path = folder / "result.npz"
@@ -145,4 +190,4 @@ def load_mesh(folder: Path, show: str = "absolute") -> ThermalMesh:
         raise ScanError(
             "it holds no temperatures", place=path, hint="`thermofusion run SCAN -o RESULT` writes it again"
         )
-    return temperature.shown(show)
+    return temperature

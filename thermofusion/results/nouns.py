@@ -35,6 +35,7 @@ def stored() -> MappingProxyType[str, type]:
     from ..types import (
         Camera,
         Observations,
+        SharedErrors,
         SignalCurve,
         SurfaceMesh,
         ThermalCamera,
@@ -55,6 +56,7 @@ def stored() -> MappingProxyType[str, type]:
             "observations/1": Observations,
             "removed-part/1": RemovedPart,
             "rig/1": RigResult,
+            "shared-errors/1": SharedErrors,
             "signal-curve/1": SignalCurve,
             "surface-mesh/1": SurfaceMesh,
             "surface/1": SurfaceResult,

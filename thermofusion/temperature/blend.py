@@ -155,6 +155,7 @@ class _Block:
     columns: dict[str, NDArray]
     parts_K: dict[str, NDArray]
     common_K: dict[str, NDArray]
+    modes_K: NDArray
 
 
 def _blend(rows: Observations, groups: Groups, L_r: Float, task: _Task, errors: ErrorModel) -> _Block:
@@ -171,6 +172,7 @@ def _blend(rows: Observations, groups: Groups, L_r: Float, task: _Task, errors: 
     }
     parts: dict[str, NDArray] = {}
     common: dict[str, NDArray] = {}
+    modes = np.zeros((len(groups), 0))
     if method in ("nearest-view", "paper"):
         pick = groups.least(rows.range_m) if method == "nearest-view" else best
         L0 = L_s = _single(rows.select(pick), task)
@@ -185,14 +187,14 @@ def _blend(rows: Observations, groups: Groups, L_r: Float, task: _Task, errors: 
         columns["spread_K"] = spread / task.slope_L
         if task.with_uncertainty:
             levers = _levers(rows, mean, solved, task, errors)
-            parts, common = _errors_of(levers, x, band.temperature_K(L_s), columns, task, errors)
+            parts, common, modes = _errors_of(levers, x, band.temperature_K(L_s), columns, task, errors)
     columns |= {"absolute_K": band.temperature_K(L_s), "normal_equivalent_K": band.temperature_K(L0)}
-    return _Block(groups.vertex, columns, parts, common)
+    return _Block(groups.vertex, columns, parts, common, modes)
 
 
 def _errors_of(
     levers: Levers, x: Float, T_K: Float, columns: dict[str, NDArray], task: _Task, errors: ErrorModel
-) -> tuple[dict[str, NDArray], dict[str, NDArray]]:
+) -> tuple[dict[str, NDArray], dict[str, NDArray], NDArray]:
     calibration = task.calibration
     fitted = calibration is not None and calibration.shape_sigma > 0
     budget = Budget(
@@ -216,8 +218,9 @@ def _assembled(blocks: list[_Block], oblique: Bool, n_vertices: int, task: _Task
     vertex = np.concatenate([b.vertex for b in blocks])
 
     def whole(pieces: list[NDArray], dtype: type) -> NDArray:
-        out: NDArray = np.full(n_vertices, 0 if dtype is np.int32 else np.nan, dtype)
-        out[vertex] = np.concatenate(pieces)
+        found = np.concatenate(pieces)
+        out: NDArray = np.full((n_vertices, *found.shape[1:]), 0 if dtype is np.int32 else np.nan, dtype)
+        out[vertex] = found
         return out
 
     def column(name: str, dtype: type = np.float64) -> NDArray:
@@ -226,12 +229,13 @@ def _assembled(blocks: list[_Block], oblique: Bool, n_vertices: int, task: _Task
 
     parts = {k: whole([b.parts_K[k] for b in blocks], np.float32) for k in blocks[0].parts_K}
     common = {k: whole([b.common_K[k] for b in blocks], np.float32) for k in blocks[0].common_K}
+    modes = whole([b.modes_K for b in blocks], np.float32)
     return BlendResult(
         output=task.settings.output,
         absolute_K=column("absolute_K"),
         normal_equivalent_K=column("normal_equivalent_K"),
         apparent_K=column("apparent_K"),
-        uncertainty=Uncertainty.of(parts or {"noise": np.full(n_vertices, np.nan)}, common),
+        uncertainty=Uncertainty.of(parts or {"noise": np.full(n_vertices, np.nan)}, common, modes),
         count=column("count", np.int32),
         oblique=oblique,
         best_angle_deg=column("best_angle_deg", np.float32),

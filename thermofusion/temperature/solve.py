@@ -17,7 +17,7 @@ from ..mapping.observe import Mapped
 from ..physics.band import ZERO_DEGC_K
 from ..progress import Progress, silent
 from ..recipe import MappingSection, TemperatureSection
-from ..types import Float32, OutputMode, Scan, SurfaceMesh, ThermalMesh, VertexFlag, brief
+from ..types import Float32, OutputMode, Scan, SharedErrors, SurfaceMesh, ThermalMesh, VertexFlag, brief
 from .blend import BlendResult, blend
 from .crosscal import Calibration, calibrate
 from .problem import ThermalProblem
@@ -27,6 +27,7 @@ Sections = tuple[MappingSection, TemperatureSection]
 METHODS = ("nearest-view", "mean", "cos-resolution", "paper", "corrected-cos", "joint")
 CAVITY_FRACTION = 0.2  # of the hemisphere: beyond it reflection between body parts exceeds 0.1 K
 HIGH_RESIDUAL = 3.0  # views disagree by more than this many of their own sigmas: hair, clothes, motion
+ANGLE_ROWS, ANGLE_STEP_DEG, ANGLE_LEAST = 200_000, 5.0, 200  # of the plot over the angle: rows, bins, rows of a bin
 UNCERTAINTY_MEANS = "one sigma about the level common to all vertices; _absolute, where the level is known: with it"
 
 
@@ -37,6 +38,7 @@ class Temperature:
     mesh : in the recipe's output mode. absolute_degC, normal_equivalent_degC, apparent_degC : (V,) float32.
     body_fraction : (V,) F, or None. level_sigma_K : one sigma of the level common to all vertices, by part; a single
     vertex's absolute interval is √(uncertainty² + Σ level²). crosscal : for the report; methods : of old results.
+    shared : what errors of vertices have in common; None where nothing tells (version 0.1.0 wrote the result, say).
     """
 
     mesh: ThermalMesh
@@ -49,6 +51,7 @@ class Temperature:
     crosscal: dict[str, Any] = field(default_factory=dict)
     methods: dict[str, Any] = field(default_factory=dict)
     messages: tuple[str, ...] = ()
+    shared: SharedErrors | None = None
 
     __repr__ = brief
 
@@ -107,9 +110,18 @@ def solve(
         body_fraction=body_fraction,
         calibration=calibration,
         level_sigma_K=result.uncertainty.level_parts_K,
-        crosscal={} if calibration is None else _crosscal_report(calibration, mapped),
+        crosscal={} if calibration is None else _crosscal_report(calibration, mapped, problem, result),
         messages=(*problem.room.assumed, *notes),
+        shared=_shared(result, problem.lens.focal_px, normal_window_m),
     )
+
+
+def _shared(result: BlendResult, focal_px: float, normal_window_m: float) -> SharedErrors | None:
+    common, modes = result.uncertainty.common_K, result.uncertainty.modes_K
+    if not common:
+        return None
+    effects = dict(common) | {f"calibration {i}": column for i, column in enumerate(modes.T, 1)}
+    return SharedErrors.of(effects, focal_px, normal_window_m)
 
 
 def calibrated(problem: ThermalProblem) -> tuple[Calibration | None, tuple[str, ...]]:
@@ -168,8 +180,9 @@ def _mesh(
     )
 
 
-def _crosscal_report(c: Calibration, mapped: Mapped) -> dict[str, Any]:
+def _crosscal_report(c: Calibration, mapped: Mapped, problem: ThermalProblem, result: BlendResult) -> dict[str, Any]:
     return {
+        "by_angle": _by_angle(c, problem, result),
         "anchored": c.anchored,
         "level_sigma_K": c.level_sigma_K,
         "offsets_K": c.offsets_K,
@@ -185,6 +198,26 @@ def _crosscal_report(c: Calibration, mapped: Mapped) -> dict[str, Any]:
         "outlier_fraction": c.outlier_fraction,
         "iterations": c.iterations,
         "converged": c.converged,
+    }
+
+
+def _by_angle(c: Calibration, problem: ThermalProblem, result: BlendResult) -> dict[str, Any]:
+    """What views read at each viewing angle less the vertex's normal-equivalent temperature, K: medians of 5°."""
+    step = max(1, len(problem.observations) // ANGLE_ROWS)
+    rows = problem.observations.select(np.arange(0, len(problem.observations), step))
+    L_r = problem.L_reflected[rows.vertex]
+    straight = problem.band.radiance(result.normal_equivalent_K[rows.vertex])
+    E = c.emissivity(problem.emissivity).relative(rows.cos_angle.astype(np.float64))
+    after = (L_r + (c.corrected(rows) - L_r) / E - straight) / c.slope_L
+    before = (rows.radiance - straight) / c.slope_L
+    angle = np.degrees(np.arccos(np.clip(rows.cos_angle, -1, 1)))
+    bins = np.digitize(angle, np.arange(0, 90, ANGLE_STEP_DEG))
+    known = np.isfinite(before) & np.isfinite(after)
+    kept = [k for k in np.unique(bins) if (known & (bins == k)).sum() >= ANGLE_LEAST]
+    return {
+        "angle_deg": [float((k - 0.5) * ANGLE_STEP_DEG) for k in kept],
+        "before_K": [float(np.median(before[known & (bins == k)])) for k in kept],
+        "after_K": [float(np.median(after[known & (bins == k)])) for k in kept],
     }
 
 

@@ -148,18 +148,21 @@ class Uncertainty:
         do beyond their common shift. views : how far views disagree, for methods that do not calibrate them.
     level_parts_K : reference, emissivity0, reflected: one number each. A relative result has no reference: its level is
         unknown beyond these.
+    modes_K : (V, R) float32, what one sigma of each strong error of the calibration does, signed: parts_K's
+        `calibration` is its length, and neighbours have it in common.
     """
 
     total_K: Float32
     parts_K: dict[str, Float32]
     level_parts_K: dict[str, float]
     common_K: dict[str, Float32]  # signed effect per vertex of one sigma of what is common
+    modes_K: Float32
 
     @classmethod
-    def of(cls, parts_K: dict[str, NDArray], common_K: dict[str, NDArray] | None = None) -> Uncertainty:
-        """From parts of single vertices and signed effects (V,) of common errors."""
+    def of(cls, parts_K: dict[str, NDArray], common_K: dict[str, NDArray], modes_K: NDArray) -> Uncertainty:
+        """From parts_K of single vertices, signed effects common_K (V,) of common errors, and modes_K (V, R)."""
         parts = {name: np.asarray(value, np.float32) for name, value in parts_K.items()}
-        common = {name: np.asarray(value, np.float32) for name, value in (common_K or {}).items()}
+        common = {name: np.asarray(value, np.float32) for name, value in common_K.items()}
         level = {}
         for name, effect in common.items():
             known = effect[np.isfinite(effect)]
@@ -167,7 +170,8 @@ class Uncertainty:
             if len(known) and np.ptp(known) > 0:
                 parts[name] = np.abs(effect - np.float32(level[name]))
         total = np.sqrt(np.sum([p.astype(np.float64) ** 2 for p in parts.values()], axis=0))
-        return cls(total.astype(np.float32), parts, {k: abs(v) for k, v in level.items()}, common)
+        level = {k: abs(v) for k, v in level.items()}
+        return cls(total.astype(np.float32), parts, level, common, np.asarray(modes_K, np.float32))
 
     @property
     def absolute_K(self) -> Float32:
@@ -229,8 +233,8 @@ class Budget:
 
 def vertex_uncertainty(
     budget: Budget, levers: Levers, x: Float, T_K: Float, path_m: NDArray, views_K: NDArray | None
-) -> tuple[dict[str, NDArray], dict[str, NDArray]]:
-    """Errors of each vertex, K: (parts, signed effects of what is common), for `Uncertainty.of`.
+) -> tuple[dict[str, NDArray], dict[str, NDArray], NDArray]:
+    """Errors of each vertex, K: (parts, signed effects of what is common, modes (V, R)), for `Uncertainty.of`.
 
     x : (V,) normal-equivalent excess, W m-2 sr-1. T_K : (V,) K. path_m : (V,) distance beyond the typical one, m.
     views_K : (V,) spread of views that were not calibrated, K. The budget is that of docs/radiometry.md.
@@ -248,9 +252,10 @@ def vertex_uncertainty(
     # The level comes from a reference (or is relative), so only the path's differences count; a corrected path is taken
     # to be right to a third of itself.
     air_loss = AIR_LOSS_PER_M if b.transmission_per_m == 1 else (1 - b.transmission_per_m) / 3
+    modes = scale * levers.modes
     parts = {
         "noise": scale * errors.netd_K * b.slope_L * np.sqrt(BILINEAR_VARIANCE * levers.squared),
-        "calibration": scale * np.sqrt((levers.modes**2).sum(1)),
+        "calibration": np.sqrt((modes**2).sum(1)),
         "shape": zero if b.shape_fitted else scale * np.abs(x * levers.loss) * errors.sigma_shape,
         "normals": scale * np.abs(x) * tilt * normal,
         "registration": np.asarray(errors.gradient_K_per_m) * levers.registration_m,
@@ -264,7 +269,7 @@ def vertex_uncertainty(
         "emissivity0": scale * x / b.epsilon0 * sigma_epsilon0 if b.absolute else zero,
         "reflected": reflected * errors.sigma_reflected_K * b.slope_reflected / b.slope_L,
     }
-    return parts, common
+    return parts, common, modes
 
 
 def covariance_modes(covariance: Float, count: int) -> Float:

@@ -1,0 +1,83 @@
+"""Verbs for looking at a result and measuring in it: report, measure, view."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .console import emit, note
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+Folder = Annotated[Path, typer.Argument(help="A result folder.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's verbs."""
+    app.command()(report)
+    app.command()(view)
+    app.command()(measure)
+
+
+def report(
+    result: Folder,
+    regions: Annotated[Path | None, typer.Option("--regions", help="Regions JSON to put into the page.")] = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="File; report.html in the result by default.")] = None,
+    deidentify: Annotated[
+        bool, typer.Option("--deidentify", help="Without colour, face, names, dates and free text.")
+    ] = False,
+    json: Json = False,
+) -> None:
+    """Write a result's report: one HTML file to look at, to measure in, and to file."""
+    path = _write(result, regions, out, deidentify)
+    emit({"written": [path], "bytes": path.stat().st_size}, f"wrote {path}", json)
+
+
+def view(result: Folder, json: Json = False) -> None:
+    """Open a result's report in the default browser; it is written first if it is not there."""
+    import webbrowser
+
+    from ..report.summary import PAGE
+
+    path = result / PAGE
+    if not path.is_file():
+        path = _write(result, None, None, False)
+    opened = webbrowser.open(path.resolve().as_uri())
+    emit({"report": path, "opened": opened}, f"{'opened' if opened else 'no browser here: open'} {path}", json)
+
+
+def _write(result: Path, regions: Path | None, out: Path | None, deidentify: bool) -> Path:
+    from ..regions import read_regions
+    from ..report.deidentify import FILE, deidentified
+    from ..report.html import write_report
+    from ..report.summary import PAGE
+    from ..results.folder import report_of
+
+    reported = report_of(result, [] if regions is None else read_regions(regions))
+    if deidentify:
+        reported = deidentified(reported)
+    return write_report(out or result / (FILE if deidentify else PAGE), reported)
+
+
+def measure(
+    result: Folder,
+    regions: Annotated[Path, typer.Option("--regions", help="Regions JSON, as the report saves it.")],
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Stem of the files; regions in the result.")] = None,
+    json: Json = False,
+) -> None:
+    """What regions of interest read: mean, its uncertainty, area, left against right; as CSV and JSON."""
+    from ..files.json import to_json
+    from ..files.whole import write_text
+    from ..regions import Measured, Measurer, read_regions
+    from ..results.folder import load_temperature
+
+    drawn = read_regions(regions)
+    temperature = load_temperature(result)
+    measured = Measured.of(Measurer(temperature.mesh, temperature.shared), drawn)
+    stem = out or result / "regions"
+    for suffix, text in ((".csv", measured.csv()), (".json", to_json(measured.document()) + "\n")):
+        write_text(stem.with_name(stem.name + suffix), text)
+    emit(measured.document(), measured.csv().rstrip(), json)
+    if not json:
+        note(f"wrote {stem}.csv and {stem}.json")

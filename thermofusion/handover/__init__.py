@@ -1,0 +1,1 @@
+"""What hospital systems take of a result."""

@@ -1,0 +1,19 @@
+"""Regions of interest: as drawn, and what they read."""
+
+from .measure import Difference, Measured, Measurer, Reading
+from .region import Brush, Lasso, Line, Region, Slab, Spot, read_regions, write_regions
+
+__all__ = [
+    "Brush",
+    "Difference",
+    "Lasso",
+    "Line",
+    "Measured",
+    "Measurer",
+    "Reading",
+    "Region",
+    "Slab",
+    "Spot",
+    "read_regions",
+    "write_regions",
+]
