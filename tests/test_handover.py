@@ -20,6 +20,7 @@ from thermofusion.export.axes import axes_of
 from thermofusion.recipe import Recipe
 from thermofusion.regions import Brush, Measurer, Spot, write_regions
 from thermofusion.report.casts import cast_views
+from thermofusion.report.html import report_html
 from thermofusion.report.metadata import stated, template
 from thermofusion.results.artifacts import save_artifact
 from thermofusion.temperature.solve import Temperature
@@ -59,15 +60,18 @@ def run(*arguments):
     return done
 
 
-def test_nothing_deidentified_tells_who_it_is(folder, tmp_path):
+def test_nothing_deidentified_tells_who_it_is(folder, tmp_path, monkeypatch):
     """Every byte of every file, as text and unpacked: no name, number, date, time, place; no colour; no face."""
     regions = write_regions(tmp_path / "r.json", [Spot(name=SECRETS[0], point_m=(0, 0.2, 0.05))])
     out = tmp_path / "out"
     page = out / "report.html"
     run("report", folder, "--deidentify", "--regions", regions, "-o", page)
-    run("export", folder, "--deidentify", "--format", "ply,glb,vtp,csv,obj,stl,vtk-mesh", "-o", out)
+    pytest.importorskip("highdicom", reason="pip install 'thermofusion[dicom]'")
+    monkeypatch.setattr("thermofusion.handover.dicom._report_pdf", lambda r: report_html(r).encode())
+    formats = "ply,glb,vtp,csv,obj,stl,vtk-mesh,dicom"
+    run("export", folder, "--deidentify", "--regions", regions, "--format", formats, "-o", out)
     files = [p for p in out.rglob("*") if p.is_file()]
-    assert len(files) == 8
+    assert {p.name for p in files} >= {"report.html", "mesh.ply", "mesh.glb", "mesh-closed.vtp", "report.dcm"}
     for path in files:
         data = path.read_bytes()
         for secret in SECRETS:

@@ -15,7 +15,7 @@ PACKAGE = ROOT / "thermofusion"
 NOUNS = ("types", "errors", "version", "progress")
 BASE = (*NOUNS, "robust", "recipe", "files", "geometry")
 STEPS = ("tracking", "surface", "rig", "mapping", "temperature")
-ALL = (*BASE, "physics", "scans", "depth", *STEPS, "export", "report", "results", "pipeline")
+ALL = (*BASE, "physics", "scans", "depth", *STEPS, "export", "regions", "report", "results", "pipeline")
 
 # Room -> rooms that it may import, late and typing imports included. What is not named is forbidden.
 MAY_IMPORT: dict[str, tuple[str, ...]] = {
@@ -36,14 +36,16 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "mapping": (*BASE, "physics", "rig"),
     "temperature": (*BASE, "physics", "mapping"),
     "export": BASE,
-    "report": (*BASE, "export", *STEPS),
-    "results": (*BASE, "export", "report", *STEPS),
+    "regions": (*BASE, "export"),
+    "report": (*BASE, "physics", "export", "regions", *STEPS),
+    "results": (*BASE, "export", "regions", "report", *STEPS),
     "pipeline": (*BASE, "scans", *STEPS, "export", "report", "results"),
+    "handover": (*BASE, "export", "regions", "report"),
     "judge": ALL,
     "calibration": (*BASE, "physics", "scans", "report"),
     "phantom": (*NOUNS, "files", "geometry"),
     "paper": (*ALL, "judge", "phantom"),
-    "cli": (*ALL, "judge", "calibration", "phantom", "paper"),
+    "cli": (*ALL, "judge", "calibration", "phantom", "paper", "handover"),
     "__init__": ALL,
     "__main__": ("cli", "errors"),
 }

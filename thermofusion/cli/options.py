@@ -14,6 +14,7 @@ from .console import low_high, note
 
 if TYPE_CHECKING:
     from ..recipe import Recipe
+    from ..report.html import Reported
     from ..types import Scan
 
 T = TypeVar("T")
@@ -73,6 +74,25 @@ class Drawing:
     def range_degC(self) -> tuple[float, float] | None:
         """The two ends of the range. Raises RecipeError."""
         return low_high(self.range_, "°C")
+
+
+@dataclass(frozen=True)
+class Filed:
+    """What of a result is filed: regions with it, and whom it may show."""
+
+    regions: Annotated[Path | None, typer.Option("--regions", help="Regions JSON, for report and DICOM.")] = None
+    deidentify: Annotated[
+        bool, typer.Option("--deidentify", help="Without colour, face, names, dates and free text.")
+    ] = False
+
+    def reported(self, result: Path) -> Reported:
+        """The result of a folder as it may be filed. Raises ScanError, RecipeError."""
+        from ..regions import read_regions
+        from ..report.deidentify import deidentified
+        from ..results.folder import report_of
+
+        reported = report_of(result, [] if self.regions is None else read_regions(self.regions))
+        return deidentified(reported) if self.deidentify else reported
 
 
 def spelled_out(verb: Callable[..., T]) -> Callable[..., T]:

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from ..errors import QualityError, RecipeError
 from .console import emit, named, note, progress
-from .options import Drawing, Json, Processing, Recording, spelled_out
-
-if TYPE_CHECKING:
-    from ..report.html import Reported
+from .options import Drawing, Filed, Json, Processing, Recording, spelled_out
 
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what stands in the result folder.")]
 STAGES = "tracking, surface, rig, mapping, temperature"  # pipeline.STAGE_NAMES, which --help has no time to load
@@ -81,10 +78,8 @@ def export(
     ] = "ply,glb,vtp",
     show: Annotated[str, typer.Option(help="absolute, normal-equivalent or apparent.")] = "absolute",
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder; the result's own by default.")] = None,
-    regions: Annotated[Path | None, typer.Option("--regions", help="dicom: regions JSON for its SR.")] = None,
-    deidentify: Annotated[
-        bool, typer.Option("--deidentify", help="Without colour, face, names, dates and free text; needs -o.")
-    ] = False,
+    *,
+    filed: Filed,
     json: Json = False,
 ) -> None:
     """Write a result's mesh and pictures again: other formats, palette, range, size, or output mode; as DICOM."""
@@ -94,12 +89,12 @@ def export(
     from ..report.pictures import write_views
 
     palette, limits = drawing.palette, drawing.range_degC
-    if deidentify and out is None:
+    if filed.deidentify and out is None:
         raise RecipeError("--deidentify needs -o: a folder of its own, apart from the files that tell who it is")
     folder = result if out is None else named(out)
     wanted = [f.strip() for f in formats.split(",")]
     dicom = "dicom" in wanted
-    reported = _reported(result, regions, deidentify) if dicom or deidentify else None
+    reported = filed.reported(result) if dicom or filed.deidentify else None
     mesh = pipeline.load_mesh(result, show) if reported is None else reported.temperature.shown(show)
     mode = "" if show == "absolute" else f"-{show}"  # other modes never replace the corrected mesh and its pictures
     meshes = [f for f in wanted if f != "dicom"]
@@ -115,12 +110,3 @@ def export(
     if outside:
         note(f"note: {outside}")
     emit({"written": written}, "\n".join(f"wrote {path}" for path in written), json)
-
-
-def _reported(result: Path, regions: Path | None, deidentify: bool) -> Reported:
-    from ..regions import read_regions
-    from ..report.deidentify import deidentified
-    from ..results.folder import report_of
-
-    reported = report_of(result, [] if regions is None else read_regions(regions))
-    return deidentified(reported) if deidentify else reported

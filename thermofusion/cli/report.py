@@ -1,4 +1,4 @@
-"""Verbs for looking at a result and measuring in it: report, measure, view."""
+"""Verbs for looking at a result and measuring in it: report, view, measure."""
 
 from __future__ import annotations
 
@@ -8,29 +8,30 @@ from typing import Annotated
 import typer
 
 from .console import emit, note
+from .options import Filed, Json, spelled_out
 
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Folder = Annotated[Path, typer.Argument(help="A result folder.")]
 
 
 def register(app: typer.Typer) -> None:
     """Add this module's verbs."""
-    app.command()(report)
+    app.command()(spelled_out(report))
     app.command()(view)
     app.command()(measure)
 
 
 def report(
     result: Folder,
-    regions: Annotated[Path | None, typer.Option("--regions", help="Regions JSON to put into the page.")] = None,
+    filed: Filed,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="File; report.html in the result by default.")] = None,
-    deidentify: Annotated[
-        bool, typer.Option("--deidentify", help="Without colour, face, names, dates and free text.")
-    ] = False,
     json: Json = False,
 ) -> None:
     """Write a result's report: one HTML file to look at, to measure in, and to file."""
-    path = _write(result, regions, out, deidentify)
+    from ..report.deidentify import FILE
+    from ..report.html import write_report
+    from ..report.summary import PAGE
+
+    path = write_report(out or result / (FILE if filed.deidentify else PAGE), filed.reported(result))
     emit({"written": [path], "bytes": path.stat().st_size}, f"wrote {path}", json)
 
 
@@ -38,26 +39,14 @@ def view(result: Folder, json: Json = False) -> None:
     """Open a result's report in the default browser; it is written first if it is not there."""
     import webbrowser
 
+    from ..report.html import write_report
     from ..report.summary import PAGE
 
     path = result / PAGE
     if not path.is_file():
-        path = _write(result, None, None, False)
+        write_report(path, Filed().reported(result))
     opened = webbrowser.open(path.resolve().as_uri())
     emit({"report": path, "opened": opened}, f"{'opened' if opened else 'no browser here: open'} {path}", json)
-
-
-def _write(result: Path, regions: Path | None, out: Path | None, deidentify: bool) -> Path:
-    from ..regions import read_regions
-    from ..report.deidentify import FILE, deidentified
-    from ..report.html import write_report
-    from ..report.summary import PAGE
-    from ..results.folder import report_of
-
-    reported = report_of(result, [] if regions is None else read_regions(regions))
-    if deidentify:
-        reported = deidentified(reported)
-    return write_report(out or result / (FILE if deidentify else PAGE), reported)
 
 
 def measure(

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import RecipeError
+from ..errors import RecipeError, ResourceError
 from ..export import write_obj
 from ..export.axes import axes_of
 from ..export.palettes import color_range
@@ -70,6 +70,10 @@ class _Study:
         return str(generate_uid(entropy_srcs=[self.seed, *names]))
 
     @property
+    def deidentified(self) -> bool:
+        return bool(self.reported.report.get("deidentified", False))
+
+    @property
     def common(self) -> dict[str, Any]:
         return {
             "study_instance_uid": self.uid("study"),
@@ -82,11 +86,18 @@ class _Study:
 
 
 def write_study(folder: Path, reported: Reported) -> list[Path]:
-    """Write the study's instances into a folder; their paths. Raises RecipeError without the extra, ResourceError."""
+    """Write the study's instances into a folder, made if need be; their paths.
+
+    Raises RecipeError without the extra, ResourceError.
+    """
     try:
         import highdicom  # noqa: F401
     except ImportError:
         raise RecipeError("DICOM needs pydicom and highdicom", hint="pip install 'thermofusion[dicom]'") from None
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise ResourceError(f"the folder cannot be made ({e.strerror})", place=folder) from None
     mesh = reported.temperature.mesh
     study = _study(reported)
     casts = cast_views(mesh.surface, axes_of(mesh.metadata), HEIGHT_PX)
@@ -208,7 +219,7 @@ def _map(study: _Study, cast: Cast, picture: Any, series: int, number: int) -> A
         manufacturer_model_name=MODEL,
         software_versions=__version__,
         device_serial_number=__version__,
-        contains_recognizable_visual_features=not study.reported.report.get("deidentified", False),
+        contains_recognizable_visual_features=not study.deidentified,
         real_world_value_mappings=[mapping],
         voi_lut_transformations=[VOILUTTransformation((low + high) / 2, max(high - low, 0.1), None, "LINEAR_EXACT")],
         content_label=label,
@@ -257,7 +268,7 @@ def _encapsulated(study: _Study, sop_class: str, mime: str, data: bytes, series:
     ds.PatientBirthDate = ds.PatientSex = ds.StudyTime = ds.AccessionNumber = ds.ReferringPhysicianName = ""
     ds.StudyDate, ds.StudyID, ds.SeriesNumber, ds.InstanceNumber = study.date, "", series, 1
     ds.ContentDate, ds.ContentTime, ds.AcquisitionDateTime = study.date, "", study.date
-    ds.BurnedInAnnotation, ds.RecognizableVisualFeatures = "YES", "YES"
+    ds.BurnedInAnnotation = ds.RecognizableVisualFeatures = "NO" if study.deidentified else "YES"
     ds.ConversionType = "WSD"
     ds.DocumentTitle, ds.ConceptNameCodeSequence = "thermofusion", []
     ds.MIMETypeOfEncapsulatedDocument, ds.Manufacturer = mime, MAKER
