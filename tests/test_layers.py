@@ -15,7 +15,7 @@ PACKAGE = ROOT / "thermofusion"
 NOUNS = ("types", "errors", "version", "progress")
 BASE = (*NOUNS, "robust", "recipe", "files", "geometry")
 STEPS = ("tracking", "surface", "rig", "mapping", "temperature")
-ALL = (*BASE, "physics", "scans", "depth", *STEPS, "export", "regions", "report", "results", "pipeline")
+ALL = (*BASE, "physics", "scans", "depth", *STEPS, "diagnosis", "export", "regions", "report", "results", "pipeline")
 
 # Room -> rooms that it may import, late and typing imports included. What is not named is forbidden.
 MAY_IMPORT: dict[str, tuple[str, ...]] = {
@@ -35,9 +35,10 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "rig": (*BASE, "physics"),
     "mapping": (*BASE, "physics", "rig"),
     "temperature": (*BASE, "physics", "mapping"),
+    "diagnosis": (*BASE, "mapping", "temperature"),
     "export": BASE,
     "regions": (*BASE, "export"),
-    "report": (*BASE, "physics", "export", "regions", *STEPS),
+    "report": (*BASE, "physics", "diagnosis", "export", "regions", *STEPS),
     "results": (*BASE, "export", "regions", "report", *STEPS),
     "pipeline": (*BASE, "scans", *STEPS, "export", "report", "results"),
     "handover": (*BASE, "export", "regions", "report"),

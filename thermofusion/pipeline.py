@@ -33,8 +33,8 @@ STAGES = (
     Stage("tracking", ("input", "subject", "tracking")),
     Stage("surface", ("input", "subject", "surface")),
     Stage("rig", ("input", "rig")),
-    Stage("mapping", ("input", "mapping")),
-    Stage("temperature", ("mapping", "temperature"), edition=2),
+    Stage("mapping", ("input", "mapping"), edition=2),
+    Stage("temperature", ("mapping", "temperature"), edition=3),
 )
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
 

@@ -196,8 +196,12 @@ class TemperatureSection(_Section):
         None, ge=0, le=45, description="of surface normals; None = estimated from depth noise and window"
     )
     sigma_registration_px: float = Field(
-        0.3, ge=0, le=20, description="of the thermal image on the mesh; an aligned rig leaves 0.15-0.3"
+        0.3, ge=0, le=20, description="of the thermal image on the mesh, where the alignment does not measure it"
     )
+    sigma_gain: float = Field(
+        0.02, ge=0, le=0.5, description="of the camera's gain: data sheets say 2 %; a second reference measures it"
+    )
+    sigma_depth_scale: float = Field(0.004, ge=0, le=0.1, description="of the depth camera's scale")
     sigma_emissivity0: float = Field(0.01, ge=0, le=0.5, description="of ε(0): enters the absolute level")
     sigma_shape: float = Field(0.15, ge=0, le=2, description="relative uncertainty of 1-ε(θ)'s shape")
     emissivity: EmissivitySection = EmissivitySection()

@@ -405,6 +405,7 @@ class VertexFlag(IntFlag):
     CAVITY = 8  # the spot sees much of the body itself (armpit, fold)
     HIGH_RESIDUAL = 16  # views disagree by more than their uncertainty explains
     MOVED = 32  # the subject moved between views
+    NOT_SKIN = 64  # hair, clothes: the reading does not change with the angle as skin's does
 
 
 @dataclass(frozen=True, eq=False)

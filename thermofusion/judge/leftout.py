@@ -21,7 +21,7 @@ from ..temperature.crosscal import Calibration, calibrate
 from ..temperature.problem import ThermalProblem
 from ..temperature.solve import Temperature
 from ..temperature.uncertainty import BILINEAR_VARIANCE, AngleTables, observation_variance, skin_slope
-from ..types import Bool, Float, Float32, Int, Observations, Scan
+from ..types import Bool, Float, Float32, Int, Observations, Scan, VertexFlag
 
 WELL_SEEN_DEG = 60.0  # a map's error is stated for surface that two views saw straighter than this
 WELL_SEEN_COS = np.float32(np.cos(np.radians(WELL_SEEN_DEG)))
@@ -67,7 +67,8 @@ class Bench:
         problem = ThermalProblem.of(scan, mesh, surface.normal_window_m, mapped, *sections)
         skin_K = temperature.absolute_degC.astype(np.float64) + ZERO_DEGC_K
         well_seen = np.bincount(rows.vertex[rows.cos_angle > WELL_SEEN_COS], minlength=len(mesh)) >= 2
-        return cls(problem.informed(mesh, skin_K), well_seen)
+        other = (temperature.mesh.flags & VertexFlag.NOT_SKIN) > 0
+        return cls(problem.informed(mesh, skin_K).without(other), well_seen)
 
     def sample(self, size: int) -> Bench:
         """An even sample of some `size` of the vertices that were seen."""

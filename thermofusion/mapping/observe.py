@@ -8,7 +8,7 @@ its pixel is clear of silhouettes: there the point spread mixes skin with room (
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -28,6 +28,7 @@ from ..types import (
     Camera,
     Float,
     Float32,
+    Int,
     Observations,
     Scan,
     SurfaceMesh,
@@ -37,6 +38,7 @@ from ..types import (
     brief,
 )
 from .motion import MotionResult, view_corrections
+from .pixels import bad_pixels
 from .references import BlackbodyReading, read_blackbodies
 from .views import thermal_views
 
@@ -87,6 +89,8 @@ class Mapped:
     """What the thermal views saw: observations of vertices, and readings of blackbodies.
 
     left_out : thermal frames that did not enter, by reason. motion : corrections of single views, if asked for.
+    bad_pixels : (B, 2) u, v px of dead, stuck or blinking pixels, which were left out.
+    outline_px : what the rig's alignment left between the outlines of model and image, NaN = not measured.
     """
 
     views: ThermalViews
@@ -94,6 +98,8 @@ class Mapped:
     observations: Observations
     blackbodies: tuple[BlackbodyReading, ...]
     motion: MotionResult | None = None
+    bad_pixels: Int = field(default_factory=lambda: np.zeros((0, 2), np.int32))
+    outline_px: float = float("nan")
 
     __repr__ = brief
 
@@ -119,8 +125,13 @@ def observe(
         motion = view_corrections(stream, surface, views, rig.outline_width_px, progress=progress)
         views = replace(views, T_world_thermal=motion.T_world_thermal)
     converter = SignalConverter(stream.camera)
+    bad = bad_pixels(stream, views.frame, converter)
+    if bad.any():
+        converter = SignalConverter(stream.camera, bad)
     observations = observe_views(stream, SurfaceRays(surface), views, converter, mapping, progress=progress)
-    return Mapped(views, left_out, observations, read_blackbodies(stream, views, scan.references, converter), motion)
+    blackbodies = read_blackbodies(stream, views, scan.references, converter)
+    uv = np.argwhere(bad)[:, ::-1].astype(np.int32)
+    return Mapped(views, left_out, observations, blackbodies, motion, uv, rig.residual_px_after)
 
 
 def observe_views(

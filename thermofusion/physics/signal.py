@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ScanError
-from ..types import Float, Float32, SignalCurve, ThermalCamera
+from ..types import Bool, Float, Float32, SignalCurve, ThermalCamera
 from .band import TABLE_K, ZERO_DEGC_K, Band
 
 MAX_UNUSABLE = 0.01  # share of an image's pixels that may lie off the radiometric curve (dead pixels)
@@ -17,13 +17,13 @@ class SignalConverter:
 
     Counts go through a look-up table of all 65,536 values, made once. Values where the camera's curve leaves its
     longest strictly monotone stretch, or 150-1500 K, are off the curve: NaN (dead pixels), an error when more
-    than 1 % of an image is.
+    than 1 % of an image is. bad_pixels : (H, W) mask of pixels that are NaN whatever they say.
 
     Raises ScanError when the curve is incomplete or usable nowhere.
     """
 
-    def __init__(self, camera: ThermalCamera) -> None:
-        self.signal = camera.signal
+    def __init__(self, camera: ThermalCamera, bad_pixels: Bool | None = None) -> None:
+        self.signal, self._bad = camera.signal, bad_pixels
         self.band = Band(*camera.band_um)
         self._lut: Float32 | None = None
         self.counts_range: tuple[int, int] | None = None
@@ -78,6 +78,8 @@ class SignalConverter:
                 place=place,
                 hint="check cameras.thermal.signal",
             )
+        if self._bad is not None:
+            out[self._bad] = np.nan
         return out
 
 

@@ -43,6 +43,7 @@ FLAG_TEXT = {
     VertexFlag.CAVITY: "in a fold",
     VertexFlag.HIGH_RESIDUAL: "views disagree",
     VertexFlag.MOVED: "moved",
+    VertexFlag.NOT_SKIN: "not skin",
 }
 TITLES = {
     "absolute": "Skin temperature",

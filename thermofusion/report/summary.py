@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..diagnosis import Diagnosis, diagnose
 from ..errors import counted
 from ..export.palettes import beyond_range
 from ..geometry.rigid import invert, rotation_angle_deg
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
 PAGE = "report.html"  # in a result's folder
 PERCENTILES = (1, 5, 50, 95, 99)
+WORST = 3  # diagnoses that the summary prints
+FAULT_OVER_SIGMA = 3.0  # of the gate's median sigma: a fault beyond it makes the result doubtful
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +70,11 @@ def result_report(scan: Scan, recipe: Recipe, steps: Steps, reused: Sequence[str
         report["radiometry"] = radiometric_numbers(scan, recipe.temperature)
         report["band_um"] = scan.thermal.camera.band_um
     report["metadata"] = stated(scan, _answered(recipe, steps))
+    diagnosis = _diagnosis(scan, steps)
+    if diagnosis is not None:
+        report["diagnosis"] = [vars(d) for d in diagnosis]
     report["quality"] = _quality(recipe, scan, steps)
+    report["quality"]["failed"] += _too_large(recipe, diagnosis or ())
     report["messages"] = messages
     report["stages_reused"] = list(reused)
     return report
@@ -100,6 +107,7 @@ def summary(report: Mapping[str, Any], out: Path | None) -> str:
         )
     if "temperature" in r:
         lines += _temperature_lines(r["temperature"])
+    lines += [f"diagnosis    {Diagnosis(**d).line()}" for d in r.get("diagnosis", [])[:WORST]]
     lines += [f"note         {m}" for m in r["messages"]]
     lines += [f"BELOW GATE   {m}" for m in r["quality"]["failed"]]
     if out is not None:
@@ -208,20 +216,35 @@ def _mapping(m: Mapped) -> dict[str, Any]:
 
 def _temperature(t: Temperature) -> dict[str, Any]:
     mesh = t.mesh
-    T, ok = mesh.temperature_degC, mesh.measured
+    T, ok = mesh.temperature_degC, mesh.measured & ((mesh.flags & VertexFlag.NOT_SKIN) == 0)
     flags = {
         flag.name.lower(): float(((mesh.flags & flag) != 0).mean()) for flag in VertexFlag if flag.name is not None
     }
     return {
         "mode": mesh.mode,
         "anchored": mesh.anchored,
-        "coverage": float(ok.mean()),
+        "coverage": float(mesh.measured.mean()),
         "percentiles_degC": {str(p): float(np.percentile(T[ok], p)) if ok.any() else None for p in PERCENTILES},
         "median_sigma_K": float(np.nanmedian(mesh.uncertainty_K)) if np.isfinite(mesh.uncertainty_K).any() else None,
         "level_sigma_K": t.level_sigma_K,
         "flags": flags,
         "crosscal": t.crosscal,
+        "criticism": {} if t.calibration is None else t.calibration.criticism,
     }
+
+
+def _diagnosis(scan: Scan, steps: Steps) -> tuple[Diagnosis, ...] | None:
+    """What the data say against the model; None where no temperature was solved for."""
+    if steps.mapped is None or steps.temperature is None or scan.thermal is None:
+        return None
+    lens = scan.thermal.camera.lens
+    return diagnose(steps.mapped, steps.temperature, (lens.width_px, lens.height_px))
+
+
+def _too_large(recipe: Recipe, diagnosis: Sequence[Diagnosis]) -> list[str]:
+    """Faults whose size is beyond what the recipe's median sigma can be believed with."""
+    limit = FAULT_OVER_SIGMA * recipe.quality.max_median_sigma_K
+    return [f"{d.what}: {d.size_K:.2f} K, more than {limit:.2f} K" for d in diagnosis if (d.size_K or 0.0) > limit]
 
 
 def _quality(recipe: Recipe, scan: Scan, steps: Steps) -> dict[str, Any]:

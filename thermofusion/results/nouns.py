@@ -30,6 +30,7 @@ def stored() -> MappingProxyType[str, type]:
     from ..surface.surface import SurfaceResult
     from ..temperature.crosscal import Calibration
     from ..temperature.field import ImageField
+    from ..temperature.pattern import Pattern
     from ..temperature.solve import Temperature
     from ..tracking.track import LostRange, TrackingResult
     from ..types import (
@@ -57,6 +58,7 @@ def stored() -> MappingProxyType[str, type]:
             "removed-part/1": RemovedPart,
             "rig/1": RigResult,
             "shared-errors/1": SharedErrors,
+            "sensor-pattern/1": Pattern,
             "signal-curve/1": SignalCurve,
             "surface-mesh/1": SurfaceMesh,
             "surface/1": SurfaceResult,

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Literal
 
 import cv2
@@ -30,6 +31,9 @@ APPARENT_RANGE_DEGC = (-10.0, 80.0)  # the median of a frame with a body, or a p
 MAX_REFERENCE_ERROR_K = 30.0  # of a camera on a blackbody: its level drifts by a few K, its emissivity costs a few more
 MAX_BASELINE_M, MAX_ANGLE_DEG = 0.5, 45.0  # between cameras on one rig
 MAX_OVERLAY_SHIFT_PX = 4.0  # a picture that fits better elsewhere by more is worth a warning
+MIN_LEVELS, MAX_LEVELS = 16, 260  # of a picture of eight bits; fewer is a test chart, or a flat wall
+FILLED_SHARE = 0.001  # of the pixels at each end of the scale: what automatic gain clips
+MOVED_SHARE = 0.5  # of the levels that the next picture has, too
 MIN_OVERLAY_CONTRAST = 1.25  # below, the best shift says nothing
 
 Severity = Literal["ok", "warning", "error"]
@@ -213,6 +217,13 @@ def _thermal_faults(scan: Scan, sample: int) -> None:
         raise ScanError("every thermal frame is marked as taken during a shutter correction", place=scan.root)
     convert = SignalConverter(scan.thermal.camera)
     picks, constant = _sample(scan.thermal, sample), 0
+    if _automatic_gain([scan.thermal.load(i) for i in picks]):
+        raise ScanError(
+            "the thermal pictures were made for the eye: 256 grey levels that are stretched anew in every frame "
+            "(automatic gain), so that no level stands for a temperature",
+            place=scan.thermal.places[picks[0]],
+            hint="record 14- or 16-bit radiometric counts, with automatic gain control off",
+        )
     for i in picks:
         degC = _apparent_degC(scan.thermal, convert, i)
         constant += _is_constant(degC)
@@ -265,6 +276,20 @@ def _reference_faults(scan: Scan, sample: int) -> None:
                 place=scan.thermal.places[i],
                 hint="check references: degC, thermal_polygon_px and frames",
             )
+
+
+def _automatic_gain(images: list[NDArray]) -> bool:
+    """Whether pictures (H, W), counts or K, have no more than 256 levels and are stretched anew in every frame.
+
+    Either both ends of the scale are filled in each of them, or the levels themselves move from frame to frame. A
+    camera with eight bits and a scale that stands still does neither.
+    """
+    found = [np.unique(image[np.isfinite(image)], return_counts=True) for image in images]
+    if len(found) < 2 or not all(MIN_LEVELS <= len(levels) <= MAX_LEVELS for levels, _ in found):
+        return False
+    filled = all(min(n[0], n[-1]) >= FILLED_SHARE * n.sum() for _, n in found)
+    moved = [np.isin(a, b).mean() < MOVED_SHARE for (a, _), (b, _) in pairwise(found)]
+    return filled or all(moved)
 
 
 def _apparent_degC(stream: ThermalStream, convert: SignalConverter, i: int) -> Float:

@@ -19,6 +19,7 @@ from ..physics.emissivity import EmissivityModel, follows_shape
 from ..physics.equation import paper_chain, surface_radiance
 from ..recipe import TemperatureSection
 from ..types import Bool, Float, Float32, Int, Observations, OutputMode
+from .criticism import patches
 from .crosscal import Calibration
 from .mean import Groups, RobustMean, Solved
 from .problem import ThermalProblem
@@ -38,6 +39,9 @@ from .uncertainty import (
 
 THREADS = 2
 BLOCK = 1_500_000  # rows worked on at once by each thread: bounds memory whatever the scan
+BLOCK_VIEWS = 5  # following each other: what they err in common is one error
+PATCH_M = 0.05  # of skin, over which vertices' own scatter is averaged: one vertex has too few views for it
+OTHER_EPSILON_SIGMA = 0.1  # of the emissivity of what is not skin: cloth and hair reach from 0.75 to 0.98
 MODES = 10  # of the calibration's covariance that are followed to each vertex
 FACING_DEG = 15.0  # what counts as straight on for the paper's S
 
@@ -50,6 +54,7 @@ class BlendResult:
     count : (V,) int32 observations that count. oblique : (V,) nothing straighter than the limit saw it.
     best_angle_deg : (V,) float32 of the straightest one; distance_m : its range. residual : (V,) float32, rms of the
     views about the vertex in sigmas of their own errors (1 = as expected; NaN for one view). spread_K : the same in K.
+    own_K2 : (V,) variance of the vertex's mean as its own rows say, K².
     """
 
     output: OutputMode
@@ -63,6 +68,7 @@ class BlendResult:
     distance_m: Float32
     residual: Float32
     spread_K: Float32
+    own_K2: Float32
 
     @property
     def temperature_K(self) -> Float:
@@ -93,12 +99,12 @@ def blend(problem: ThermalProblem, calibration: Calibration | None, *, with_unce
         rows = observations.select(mine[order])
         local = replace(problem.errors, gradient_K_per_m=gradient[groups.vertex])
         rows = replace(rows, vertex=groups.rows(np.arange(len(groups), dtype=np.int32)))
-        return _blend(rows, groups, problem.L_reflected, task, local)
+        return _blend(rows, groups, problem, task, local)
 
     rounds = max(1, -(-len(observations) // (THREADS * BLOCK)))  # whole rounds: no thread waits for the other
     edges = np.linspace(0, n_vertices, THREADS * rounds + 1).astype(int).tolist()
     with ThreadPoolExecutor(max_workers=THREADS) as pool:
-        return _assembled(list(pool.map(block, pairwise(edges))), oblique, n_vertices, task)
+        return _assembled(list(pool.map(block, pairwise(edges))), oblique, problem, task)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +120,9 @@ class _Task:
     slope_L: float
     paper_S: float
     distance_m: float  # typical
+    middle_m: Float32  # (3,) of the body
+    registration_over: float
+    gain_pivot_K: float | None
     with_uncertainty: bool
 
     @classmethod
@@ -130,6 +139,9 @@ class _Task:
             slope_L=calibration.slope_L if calibration else skin_slope(problem.band, rows.radiance),
             paper_S=_paper_scale(rows, given, problem.band, problem.room) if settings.method == "paper" else 1.0,
             distance_m=float(np.median(rows.range_m)) if len(rows) else 0.0,
+            middle_m=np.median(problem.points_m, axis=0),
+            registration_over=problem.errors.registration_over,
+            gain_pivot_K=_gain_pivot_K(problem, calibration),
             with_uncertainty=with_uncertainty,
         )
 
@@ -158,9 +170,9 @@ class _Block:
     modes_K: NDArray
 
 
-def _blend(rows: Observations, groups: Groups, L_r: Float, task: _Task, errors: ErrorModel) -> _Block:
+def _blend(rows: Observations, groups: Groups, problem: ThermalProblem, task: _Task, errors: ErrorModel) -> _Block:
     """Blend rows that are grouped by vertex; their vertices are numbered by group."""
-    method, band, L_r = task.settings.method, task.band, L_r[groups.vertex]
+    method, band, L_r = task.settings.method, task.band, problem.L_reflected[groups.vertex]
     best = groups.least(-rows.cos_angle)
     resolution = 1 / rows.footprint_m2
     apparent = groups.sums(resolution * rows.radiance) / groups.sums(resolution)
@@ -169,6 +181,7 @@ def _blend(rows: Observations, groups: Groups, L_r: Float, task: _Task, errors: 
         "best_angle_deg": np.degrees(np.arccos(np.clip(rows.cos_angle[best], -1, 1))),
         "distance_m": rows.range_m[best],
         "apparent_K": band.temperature_K(apparent),
+        "radius_m": np.linalg.norm(problem.points_m[groups.vertex] - task.middle_m, axis=1),
     }
     parts: dict[str, NDArray] = {}
     common: dict[str, NDArray] = {}
@@ -185,6 +198,7 @@ def _blend(rows: Observations, groups: Groups, L_r: Float, task: _Task, errors: 
         L0, L_s = surface_radiance(x, 1.0, L_r), surface_radiance(x, task.epsilon0, L_r)
         columns["residual"], spread = mean.scatter(solved)
         columns["spread_K"] = spread / task.slope_L
+        columns["own_K2"] = mean.own_variance(solved, rows.view // BLOCK_VIEWS) / (task.slope_L * task.epsilon0) ** 2
         if task.with_uncertainty:
             levers = _levers(rows, mean, solved, task, errors)
             parts, common, modes = _errors_of(levers, x, band.temperature_K(L_s), columns, task, errors)
@@ -205,17 +219,22 @@ def _errors_of(
         slope_reflected=float(task.band.d_radiance_dT(task.room.reflected_K)),
         shape_fitted=fitted,
         epsilon0_follows=fitted and follows_shape(task.given),
-        reference_sigma_K=calibration.reference_sigma_K if calibration else np.nan,
+        level_sigma_K=calibration.level_sigma_K if calibration else np.nan,
         air_K=task.room.air_K,
         transmission_per_m=task.settings.transmission_per_m,
+        sigma_normal_deg=errors.sigma_normal_deg if calibration is None else calibration.sigma_normal_deg,
+        registration_over=task.registration_over,
+        pattern_K=0.0 if calibration is None else calibration.pattern_sigma_K,
+        gain_pivot_K=task.gain_pivot_K,
     )
     views_K = None if calibration else columns["spread_K"]
-    return vertex_uncertainty(budget, levers, x, T_K, columns["distance_m"] - task.distance_m, views_K)
+    path_m = columns["distance_m"] - task.distance_m
+    return vertex_uncertainty(budget, levers, x, T_K, path_m, columns["radius_m"], views_K)
 
 
-def _assembled(blocks: list[_Block], oblique: Bool, n_vertices: int, task: _Task) -> BlendResult:
+def _assembled(blocks: list[_Block], oblique: Bool, problem: ThermalProblem, task: _Task) -> BlendResult:
     """Blocks put into arrays of all vertices: NaN, and count 0, where none was seen."""
-    vertex = np.concatenate([b.vertex for b in blocks])
+    vertex, n_vertices = np.concatenate([b.vertex for b in blocks]), len(problem)
 
     def whole(pieces: list[NDArray], dtype: type) -> NDArray:
         found = np.concatenate(pieces)
@@ -228,11 +247,18 @@ def _assembled(blocks: list[_Block], oblique: Bool, n_vertices: int, task: _Task
         return whole([b.columns.get(name, n) for b, n in zip(blocks, nan, strict=True)], dtype)
 
     parts = {k: whole([b.parts_K[k] for b in blocks], np.float32) for k in blocks[0].parts_K}
+    own_K2 = column("own_K2", np.float32)
+    if parts and task.settings.method == "joint":
+        parts["noise"] = _own_noise(parts["noise"], own_K2, problem.points_m)
+    T_K = column("absolute_K")
+    if parts and problem.other is not None:
+        unknown = OTHER_EPSILON_SIGMA * np.abs(T_K - problem.room.reflected_K)
+        parts["not_skin"] = np.where(problem.other | np.isnan(T_K), unknown, 0).astype(np.float32)
     common = {k: whole([b.common_K[k] for b in blocks], np.float32) for k in blocks[0].common_K}
     modes = whole([b.modes_K for b in blocks], np.float32)
     return BlendResult(
         output=task.settings.output,
-        absolute_K=column("absolute_K"),
+        absolute_K=T_K,
         normal_equivalent_K=column("normal_equivalent_K"),
         apparent_K=column("apparent_K"),
         uncertainty=Uncertainty.of(parts or {"noise": np.full(n_vertices, np.nan)}, common, modes),
@@ -242,7 +268,25 @@ def _assembled(blocks: list[_Block], oblique: Bool, n_vertices: int, task: _Task
         distance_m=column("distance_m", np.float32),
         residual=column("residual", np.float32),
         spread_K=column("spread_K", np.float32),
+        own_K2=own_K2,
     )
+
+
+def _gain_pivot_K(problem: ThermalProblem, calibration: Calibration | None) -> float | None:
+    """The temperature at which an error of the gain changes nothing: the references', else the usual reading."""
+    if calibration is not None and calibration.gain != 1:
+        return None
+    expected = [b.expected for b in problem.blackbodies] or [c.expected for c in problem.contacts]
+    L = np.mean(expected) if expected else np.nanmedian(problem.observations.radiance)
+    return float(problem.band.temperature_K(L))
+
+
+def _own_noise(noise_K: Float32, own_K2: Float32, points_m: Float32) -> Float32:
+    """Noise (V,) K at points_m (V, 3), but no smaller than what the rows of their patch say, own_K2 (V,) K²."""
+    number, _ = patches(points_m, PATCH_M)
+    known = np.isfinite(own_K2)
+    mean = np.bincount(number, np.where(known, own_K2, 0)) / np.maximum(np.bincount(number, known), 1)
+    return np.sqrt(np.maximum(noise_K**2, mean[number])).astype(np.float32)
 
 
 # ---------------------------------------------------------------- which observations count

@@ -12,24 +12,31 @@ is relative). See docs/radiometry.md.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
+from scipy.stats import chi2 as chi2_distribution
+from scipy.stats import t as student
 
 from ..errors import ScanError
 from ..physics.emissivity import AngleTable, EmissivityModel, reshaped, shape_direction
 from ..physics.equation import without_gain
+from ..robust import MAD_PER_SIGMA, NORMAL_95
 from ..types import Bool, Float, Float32, Observations, brief
 from .field import ImageField
 from .layout import Layout
+from .pattern import Pattern
 from .problem import ThermalProblem
 from .references import ContactReading, ExpectedReading
+from .refine import Refinement, refine
 from .system import SHAPE_BOUNDS, ContactRow, KnownField, OverlapSystem, Solution, condition_number
-from .uncertainty import AngleTables, covariance_modes, observation_variance, skin_slope
+from .uncertainty import DEFAULT_SIGMA_NORMAL_DEG, AngleTables, covariance_modes, observation_variance, skin_slope
 
 FIELD_HELD = 0.7  # of the prior's sigma: a pattern of the field less certain than this is held at zero
 SHAPE_HELD = 0.5  # a shape less certain than half the way between the skin presets is held
@@ -38,6 +45,11 @@ ROWS_PER_VERTEX = 20  # bound on the system: max_vertices x this many observatio
 SUPPORT_CELLS = 24  # across the image; the field is known in those that hold so many rows of so many views
 SUPPORT_ROWS, SUPPORT_VIEWS = 25, 3
 MIN_SHARED = 20  # vertices that two views must share to count as overlapping
+SENSOR_MODES = 48  # of the covariance, where a sensor's pattern is in it: its errors are many and small
+READINGS_ALIKE = 0.01  # chance below which references' scatter is no chance
+NORMALS_VIEWS, NORMALS_ROWS = 5, 5000  # that the normals' sigma is estimated from
+NORMALS_HIDDEN = 1.6  # part of a normal's error is the same for all views of a vertex: 1.2° shows as 0.7-0.8°
+NORMALS_BOUNDS_DEG = (0.5, 5.0)
 ERROR_RASTER = 32  # cells along each side on which the field's error is evaluated
 
 
@@ -51,7 +63,9 @@ class Calibration:
     on it. Both are NaN for a relative result. residual_sigma : robust scale of residuals over their predicted σ.
     view_rms_K : (N_views,) weighted residual. outlier_fraction : share of observations left without weight.
     condition : of the offsets on what overlap can see. held : parameters asked for that the data cannot carry.
-    messages : what a user should know.
+    sensor : what the sensor adds beyond the field. sigma_normal_deg : as residuals show it. pattern_sigma_K : of what
+    residuals still have in common by place in the image. criticism : what residuals said. messages : what a
+    user should know.
     """
 
     offset_radiance: Float
@@ -73,13 +87,18 @@ class Calibration:
     iterations: int
     converged: bool
     messages: tuple[str, ...]
+    sensor: Pattern | None = None
+    sigma_normal_deg: float = DEFAULT_SIGMA_NORMAL_DEG
+    pattern_sigma_K: float = 0.0
+    criticism: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     __repr__ = brief
 
     @property
     def layout(self) -> Layout:
         """Where the parameters stand in `covariance`."""
-        return Layout(len(self.offset_radiance), len(self.field.coefficients))
+        n_sensor = 0 if self.sensor is None else len(self.sensor.coefficients)
+        return Layout(len(self.offset_radiance), len(self.field.coefficients), n_sensor)
 
     @property
     def offsets_K(self) -> Float:
@@ -96,11 +115,13 @@ class Calibration:
         camera = self.offset_radiance[observations.view]
         if np.any(self.field.coefficients):
             camera = camera + self.field(observations.u_px, observations.v_px)
+        if self.sensor is not None:
+            camera = camera + self.sensor(observations.u_px, observations.v_px, observations.view)
         return without_gain(L, camera, self.gain, self.pivot_radiance)
 
     def error_modes(self, count: int) -> Callable[[Observations, NDArray], Float32]:
-        """How the strongest error modes of this calibration shift observations: (rows, x of rows) -> (N, count)."""
-        modes = covariance_modes(self.covariance, count).astype(np.float32)
+        """How the strongest error modes of this calibration shift observations: (rows, x of rows) -> (N, R)."""
+        modes = covariance_modes(self.covariance, count if self.sensor is None else SENSOR_MODES).astype(np.float32)
         at, n = self.layout, ERROR_RASTER
         du, dv = self.field.width_px / n, self.field.height_px / n
         v, u = (np.mgrid[0:n, 0:n].reshape(2, -1) + 0.5) * np.array([[dv], [du]])
@@ -110,12 +131,47 @@ class Calibration:
         def effect(rows: Observations, x: NDArray) -> Float32:
             cell = (rows.v_px / np.float32(dv)).astype(np.int32) * n + (rows.u_px / np.float32(du)).astype(np.int32)
             out = modes[rows.view] + raster[np.clip(cell, 0, n * n - 1)]
+            if self.sensor is not None:
+                out += self.sensor.columns(rows.u_px, rows.v_px, rows.view).astype(np.float32) @ modes[at.sensor]
             return np.asarray(out + (x * direction(rows.cos_angle))[:, None].astype(np.float32) * modes[at.shape])
 
         return effect
 
 
 def calibrate(problem: ThermalProblem) -> Calibration:
+    """What the overlap says of offsets, field, shape and gain, and of the sensor's pattern where that is asked for.
+
+    Raises ScanError if no vertex was seen by two views.
+    """
+    return Overlap.of(problem).refined()
+
+
+@dataclass(frozen=True, eq=False)
+class Overlap:
+    """A problem's overlap, solved without a pattern of the sensor."""
+
+    problem: ThermalProblem
+    system: OverlapSystem
+    solution: Solution
+    rows: Observations
+    held: tuple[str, ...]
+
+    @classmethod
+    def of(cls, problem: ThermalProblem) -> Overlap:
+        """Solved; see `_settled`. Raises ScanError."""
+        return cls(problem, *_settled(problem))
+
+    def plain(self) -> Calibration:
+        """Without a pattern of the sensor."""
+        return _result(self, None)
+
+    def refined(self) -> Calibration:
+        """With the sensor's pattern, where residuals and left-out views ask for one."""
+        found = refine(self.problem, self.system, self.solution, self.rows)
+        return _result(replace(self, system=found.system, solution=found.solution, rows=found.rows), found)
+
+
+def _settled(problem: ThermalProblem) -> tuple[OverlapSystem, Solution, Observations, tuple[str, ...]]:
     """Solve for offsets, field, shape and gain from all vertices that two or more views saw, clear of outlines.
 
     Blackbodies set the level together, contact thermometers where no blackbody does. A million rows are not a million
@@ -134,9 +190,7 @@ def calibrate(problem: ThermalProblem) -> Calibration:
         held = ("gain", *held)
     if reduced is not system:
         system, solution = reduced, reduced.solve()
-    group = np.arange(problem.n_views) if settings.offsets else np.zeros(problem.n_views, np.intp)
-    bias = _shape_bias(problem.emissivity, problem.errors.sigma_normal_deg)
-    return _result(system, solution, group, chosen, held, bias)
+    return system, solution, chosen, held
 
 
 def _choose(observations: Observations, problem: ThermalProblem) -> Observations:
@@ -284,27 +338,30 @@ def _shape_bias(emissivity: EmissivityModel, sigma_normal_deg: float) -> float:
     return float(bend @ D / (D @ D))
 
 
-def _result(
-    system: OverlapSystem,
-    solution: Solution,
-    group: NDArray,
-    rows: Observations,
-    held: tuple[str, ...],
-    shape_bias: float,
-) -> Calibration:
+def _result(overlap: Overlap, refinement: Refinement | None) -> Calibration:
     """The solution in terms of views and the whole field."""
-    at, n, slope = system.layout, len(group), system.slope_L
-    whole = Layout(n, len(system.keep))
+    problem, system, solution, rows, held = vars(overlap).values()
+    at, n, slope = system.layout, problem.n_views, system.slope_L
+    group = np.arange(n) if problem.settings.crosscal.offsets else np.zeros(n, np.intp)
+    shape_bias = _shape_bias(problem.emissivity, problem.errors.sigma_normal_deg)
+    whole = Layout(n, len(system.keep), at.n_sensor)
     expand = np.zeros((whole.size, at.size))
     expand[np.arange(n), group] = 1.0
     expand[whole.field, at.field] = system.keep
     expand[whole.shape, at.shape], expand[whole.gain, at.gain] = float(system.use_shape), float(system.use_gain)
-    p, covariance = expand @ solution.p, expand @ solution.covariance @ expand.T
-    level_sigma = _level_sigma(system, solution)
+    expand[whole.sensor, at.sensor] = np.eye(at.n_sensor)
+    mean, level_variance = _mean_effect(system, solution), _level_variance(system, solution)
+    level_sigma = float("nan")
+    if system.anchored:
+        level_sigma = float(np.sqrt(mean @ solution.covariance @ mean + level_variance) / system.slope_L)
+    # what shifts all readings alike is the level's, not the single vertex's
+    apart = np.eye(at.size)
+    apart[at.offsets] -= mean
+    p, covariance = expand @ solution.p, expand @ (apart @ solution.covariance @ apart.T) @ expand.T
     shape_sigma = 0.0
     if system.use_shape:
         # a relative result's level is off by the mean of the true offsets, and takes s along
-        off = float(np.sqrt(solution.level_variance)) if system.anchored else float(np.std(p[whole.offsets]))
+        off = float(np.sqrt(level_variance)) if system.anchored else float(np.std(p[whole.offsets]))
         shape_sigma = float(
             np.sqrt(covariance[whole.shape, whole.shape] + (solution.level_gain[at.shape] * off) ** 2 + shape_bias**2)
         )
@@ -323,7 +380,7 @@ def _result(
         covariance=covariance,
         slope_L=slope,
         anchored=system.anchored,
-        reference_sigma_K=float(np.sqrt(solution.level_variance)) / slope if system.anchored else float("nan"),
+        reference_sigma_K=float(np.sqrt(level_variance)) / slope if system.anchored else float("nan"),
         level_sigma_K=level_sigma,
         residual_sigma=solution.scale,
         view_rms_K=view_rms,
@@ -332,19 +389,84 @@ def _result(
         held=held,
         iterations=solution.iterations,
         converged=solution.converged,
+        sensor=None if refinement is None else refinement.pattern,
+        sigma_normal_deg=_sigma_normal_deg(rows, system, solution, problem),
+        pattern_sigma_K=0.0 if refinement is None else refinement.left_K,
+        criticism={} if refinement is None else _told(refinement, system, solution),
         messages=_messages(system, solution, held, _groups(rows, n, solution.weight > 0)),
     )
 
 
-def _level_sigma(system: OverlapSystem, solution: Solution) -> float:
-    """One sigma of the common level of all vertices, K; NaN for a relative result."""
-    if not system.anchored:
-        return float("nan")
-    at = system.layout
-    g, w = np.zeros(at.size), solution.weight / solution.weight.sum()
-    g[at.offsets] = np.bincount(system.group, w, at.n_offsets)
-    g[at.field] = w @ system.patterns
-    return float(np.sqrt(g @ solution.covariance @ g + solution.level_variance) / system.slope_L)
+def _mean_effect(system: OverlapSystem, solution: Solution) -> Float:
+    """(P,) what each parameter adds to readings on average: how the level of all vertices hangs on it."""
+    at, w = system.layout, solution.weight / solution.weight.sum()
+    out = np.zeros(at.size)
+    out[at.offsets] = np.bincount(system.group, w, at.n_offsets)
+    out[at.field] = w @ system.patterns
+    if system.sensor_columns is not None:
+        out[at.sensor] = w @ system.sensor_columns
+    return out
+
+
+def _level_variance(system: OverlapSystem, solution: Solution) -> float:
+    """Variance of what references say of the level, larger where they contradict each other beyond chance.
+
+    The scatter of readings about the solution over its expected size is Birge's ratio; a few readings know their own
+    scatter badly, which Student's t pays for. It shifts all: (W m-2 sr-1)².
+    """
+    chi2, freedom, weight = _readings_scatter(system, solution)
+    if not freedom or chi2 < chi2_distribution.isf(READINGS_ALIKE, freedom):
+        return solution.level_variance
+    wide = (student.isf(0.025, freedom) / NORMAL_95) ** 2 * chi2 / freedom
+    return solution.level_variance + (wide - 1) / weight
+
+
+def _readings_scatter(system: OverlapSystem, solution: Solution) -> tuple[float, int, float]:
+    """Of readings of references about the solution: χ², degrees of freedom, and the sum of weights, (W m-2 sr-1)-2."""
+    rows = system.reading_rows()
+    if len(rows) < 2:
+        return 0.0, 0, 1.0
+    off = np.array([r.measured - r.expected - row @ solution.p for r, row, _ in rows])
+    w = np.array([weight for *_, weight in rows])
+    return float(w @ (off - w @ off / w.sum()) ** 2), len(rows) - 1, float(w.sum())
+
+
+def _sigma_normal_deg(rows: Observations, system: OverlapSystem, solution: Solution, problem: ThermalProblem) -> float:
+    """The normals' sigma, deg: as the squares of residuals rise with (x dE/dθ)²; the recipe's where it states one.
+
+    A straight line through the medians of ten classes of slope, times `NORMALS_HIDDEN`.
+    """
+    stated = problem.settings.sigma_normal_deg
+    if stated is not None:
+        return stated
+    lever = solution.x[system.vertex] * AngleTables.of(problem.emissivity).slope(rows.cos_angle)
+    n = np.diff(system.start)[system.vertex]
+    good = (n >= NORMALS_VIEWS) & (solution.weight > 0)
+    if good.sum() < NORMALS_ROWS:
+        return problem.errors.sigma_normal_deg
+    square = (system.y - system.predict(solution.p, solution.x))[good] ** 2 * (n / (n - 1))[good]
+    lever2 = lever[good] ** 2
+    edges = np.quantile(lever2, np.linspace(0, 1, 11))
+    number = np.clip(np.searchsorted(edges, lever2) - 1, 0, 9)
+    rise = [np.median(lever2[number == k]) for k in range(10)]
+    variance = [np.median(square[number == k]) / MAD_PER_SIGMA**2 for k in range(10)]
+    slope = float(np.polyfit(rise, variance, 1)[0])
+    return float(np.clip(NORMALS_HIDDEN * np.degrees(np.sqrt(max(slope, 0.0))), *NORMALS_BOUNDS_DEG))
+
+
+def _told(r: Refinement, system: OverlapSystem, solution: Solution) -> dict[str, Any]:
+    """Criticism for the report: agreement of residuals by coordinate, without and with the sensor's pattern, [K, z];
+    references_K : scatter of references' readings where it is no chance."""
+    chi2, freedom, weight = _readings_scatter(system, solution)
+    scatter = 0.0
+    if freedom and chi2 > chi2_distribution.isf(READINGS_ALIKE, freedom):
+        scatter = float(np.sqrt(chi2 / freedom * (freedom + 1) / weight)) / system.slope_L
+    return {
+        "before": {k: [a.size_K, a.z] for k, a in r.before.items()},
+        "after": {k: [a.size_K, a.z] for k, a in r.after.items()},
+        "left_out_views_better": r.better,
+        "references_K": scatter,
+    }
 
 
 def _messages(system: OverlapSystem, solution: Solution, held: tuple[str, ...], groups: int) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from ..physics.band import Band
 from ..physics.emissivity import EmissivityModel, model_from_recipe
 from ..physics.equation import leaving_radiance
 from ..recipe import MappingSection, TemperatureSection
-from ..types import Bool, Camera, Float, Observations, Scan, SurfaceMesh
+from ..types import Bool, Camera, Float, Float32, Int, Observations, Scan, SurfaceMesh
 from .references import ContactReading, ExpectedReading, contact_readings, expected_readings
 from .room import Room, room_of
 from .surroundings import SurroundingsResult, surroundings
@@ -24,19 +24,24 @@ from .uncertainty import ErrorModel
 class ThermalProblem:
     """What the temperature of V vertices is solved from. Radiances in W m-2 sr-1.
 
-    vertices : (V,) their numbers in the mesh. observations : of them, freed of the air path, clear of outlines or the
-    best there is; sorted by (view, vertex). clear : (N,) mask of rows that lie clear of outlines: they calibrate.
-    counts : (N,) mask of rows that the map of all views is made of: a part of the views must not fall back on worse.
-    n_views : of the whole scan, whatever part is left. L_reflected : (V,) that vertices are lit by. around : what they
-    see of the body; None where that is switched off, or vertices are a sample. errors : one-sigma parts of an
-    observation. blackbodies, contacts : what sets the level. vertices_per_patch : vertices that share a normal's error.
+    vertices : (V,) their numbers in the mesh. points_m : (V, 3) where they are, world.
+    observations : of them, freed of the air path, clear of outlines or the best there is; sorted by (view, vertex).
+    clear : (N,) mask of rows that lie clear of outlines: they calibrate. counts : (N,) mask of rows that the map of all
+    views is made of: a part of the views must not fall back on worse. n_views : of the whole scan, whatever part is
+    left; view_times_s : (n_views,) when; restarts : views that follow a shutter correction that the recording marks.
+    L_reflected : (V,) that vertices are lit by. around : what they see of the body; None where that is switched off, or
+    vertices are a sample. errors : one-sigma parts of an observation. blackbodies, contacts : what sets the level.
+    vertices_per_patch : vertices that share a normal's error. other : (V,) what is not skin, None = not asked.
     """
 
     vertices: NDArray[np.intp]
+    points_m: Float32
     observations: Observations
     clear: Bool
     counts: Bool
     n_views: int
+    view_times_s: Float
+    restarts: tuple[int, ...]
     lens: Camera
     band: Band
     emissivity: EmissivityModel
@@ -49,6 +54,7 @@ class ThermalProblem:
     vertices_per_patch: float
     mapping: MappingSection
     settings: TemperatureSection
+    other: Bool | None = None
 
     @classmethod
     def of(
@@ -76,17 +82,20 @@ class ThermalProblem:
         straight_seen = np.bincount(rows.vertex[straight], minlength=len(surface)) > 0
         problem = cls(
             vertices=np.arange(len(surface)),
+            points_m=surface.vertices_m,
             observations=rows,
             clear=clear,
             counts=straight | ~straight_seen[rows.vertex],
             n_views=len(mapped.views),
+            view_times_s=mapped.views.times_s,
+            restarts=_restarts(scan.thermal.usable, mapped.views.frame),
             lens=camera.lens,
             band=band,
             emissivity=model_from_recipe(settings.emissivity, band),
             room=room,
             L_reflected=np.full(len(surface), L_room),
             around=surroundings(surface) if settings.crosscal.surroundings else None,
-            errors=ErrorModel.of(camera, settings),
+            errors=replace(ErrorModel.of(camera, settings), aligned_px=mapped.outline_px),
             blackbodies=expected_readings(mapped.blackbodies, scan.references, band, L_room),
             contacts=contact_readings(scan.references, surface, band, scan.root),
             vertices_per_patch=vertices_per_patch(surface, normal_window_m),
@@ -129,6 +138,10 @@ class ThermalProblem:
             blackbodies=tuple(b for b in self.blackbodies if views[b.view]),
         )
 
+    def without(self, vertices: Bool) -> ThermalProblem:
+        """The vertices of a mask (V,) are not skin: they take no part in calibration."""
+        return replace(self, clear=self.clear & ~vertices[self.observations.vertex], other=vertices)
+
     def sample(self, size: int) -> ThermalProblem:
         """An even sample of some `size` of the vertices that were seen, and those under contact thermometers."""
         seen = np.unique(self.observations.vertex)
@@ -143,6 +156,8 @@ class ThermalProblem:
         return replace(
             self,
             vertices=self.vertices[chosen],
+            other=None if self.other is None else self.other[chosen],
+            points_m=self.points_m[chosen],
             observations=replace(rows, vertex=number[rows.vertex]),
             clear=self.clear[mine],
             counts=self.counts[mine],
@@ -152,6 +167,12 @@ class ThermalProblem:
             contacts=tuple(c for c in contacts if len(c.vertices)),
             vertices_per_patch=self.vertices_per_patch * len(chosen) / len(self),
         )
+
+
+def _restarts(usable: Bool, frame: Int) -> tuple[int, ...]:
+    """Views before which a frame was marked unusable, the mark of a shutter; usable (F,), frame (M,) index."""
+    marked = np.insert(np.cumsum(~usable), 0, 0)
+    return tuple((np.flatnonzero(np.diff(marked[frame]) > 0) + 1).tolist())
 
 
 def remove_air_path(observations: Observations, transmission_per_m: float, L_air: float) -> Observations:

@@ -17,11 +17,12 @@ from ..mapping.observe import Mapped
 from ..physics.band import ZERO_DEGC_K
 from ..progress import Progress, silent
 from ..recipe import MappingSection, TemperatureSection
-from ..types import Float32, OutputMode, Scan, SharedErrors, SurfaceMesh, ThermalMesh, VertexFlag, brief
+from ..types import Bool, Float32, OutputMode, Scan, SharedErrors, SurfaceMesh, ThermalMesh, VertexFlag, brief
 from .blend import BlendResult, blend
-from .crosscal import Calibration, calibrate
+from .crosscal import Calibration, Overlap
 from .problem import ThermalProblem
 from .room import Room
+from .skin import not_skin
 
 Sections = tuple[MappingSection, TemperatureSection]
 METHODS = ("nearest-view", "mean", "cos-resolution", "paper", "corrected-cos", "joint")
@@ -94,7 +95,8 @@ def solve(
     """
     problem = ThermalProblem.of(scan, mesh, normal_window_m, mapped, mapping, temperature)
     progress("temperature", 1, 4)
-    calibration, notes = calibrated(problem)
+    calibration, notes, other = calibrated(problem)
+    problem = problem.without(other) if other.any() else problem
     progress("temperature", 2, 4)
     first = blend(problem, calibration, with_uncertainty=False)
     problem = problem.informed(mesh, first.absolute_K)
@@ -103,7 +105,7 @@ def solve(
     progress("temperature", 4, 4)
     body_fraction = None if problem.around is None else problem.around.body_fraction
     return Temperature(
-        mesh=_mesh(mesh, result, calibration, body_fraction, problem.room),
+        mesh=_mesh(mesh, result, calibration, body_fraction, problem.room, other),
         absolute_degC=_degC(result.absolute_K),
         normal_equivalent_degC=_degC(result.normal_equivalent_K),
         apparent_degC=_degC(result.apparent_K),
@@ -124,14 +126,23 @@ def _shared(result: BlendResult, focal_px: float, normal_window_m: float) -> Sha
     return SharedErrors.of(effects, focal_px, normal_window_m)
 
 
-def calibrated(problem: ThermalProblem) -> tuple[Calibration | None, tuple[str, ...]]:
-    """The cross-calibration and its messages, or None and why there is none."""
+def calibrated(problem: ThermalProblem) -> tuple[Calibration | None, tuple[str, ...], Bool]:
+    """The cross-calibration and its messages, or None and why there is none; and which vertices (V,) are not skin.
+
+    What is not skin takes no part in the calibration.
+    """
+    none = np.zeros(len(problem), bool)
     if problem.settings.method != "joint":
-        return None, ()
+        return None, (), none
     if problem.n_views < 2:
-        return None, ("one thermal view cannot be cross-calibrated: the camera's offset stays in the result",)
-    calibration = calibrate(problem)
-    return calibration, calibration.messages
+        return None, ("one thermal view cannot be cross-calibrated: the camera's offset stays in the result",), none
+    overlap = Overlap.of(problem)
+    plain = overlap.plain()
+    other = not_skin(problem, plain, blend(problem, plain, with_uncertainty=False))
+    if other.any():
+        overlap = Overlap.of(problem.without(other))
+    calibration = overlap.refined()
+    return calibration, calibration.messages, other
 
 
 def unmeasured(surface: SurfaceMesh, temperature: TemperatureSection) -> Temperature:
@@ -151,8 +162,10 @@ def _mesh(
     calibration: Calibration | None,
     body_fraction: Float32 | None,
     room: Room,
+    other: Bool,
 ) -> ThermalMesh:
     flags = np.zeros(len(surface), np.uint8)
+    flags[other] |= np.uint8(VertexFlag.NOT_SKIN)
     flags[result.count == 1] |= np.uint8(VertexFlag.SINGLE_VIEW)
     flags[result.oblique] |= np.uint8(VertexFlag.OBLIQUE)
     flags[np.nan_to_num(result.residual) > HIGH_RESIDUAL] |= np.uint8(VertexFlag.HIGH_RESIDUAL)

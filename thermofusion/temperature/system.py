@@ -9,23 +9,28 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve
 from scipy.sparse import csr_matrix
 
 from ..physics.equation import excess_reading
 from ..robust import HUBER, MAD_PER_SIGMA, TUKEY, huber_weight, tukey_weight
-from ..types import Float, Int
+from ..types import Bool, Float, Int
 from .field import ImageField
 from .layout import Layout
+from .pattern import Pattern
 from .references import ExpectedReading
 
 HUBER_STEPS, TUKEY_STEPS = 4, 40
 CONVERGED_K = 1e-4  # a hundredth of what any result is good to
+SENSOR_CONVERGED_K = 2e-3  # of a single pixel's or column's part: a vertex's mean knows a tenth of it
 OFFSET_PRIOR_K = 5.0  # spread of offsets about their mean: only matters for views that overlap with none
 FIELD_PRIOR_K = {1: 0.15, 2: 0.15, 3: 0.07, 4: 0.07}  # rms of a field pattern by polynomial order; 0.1-0.3 K together
 FIELD_UNKNOWN_K, FIELD_MEMORY = 0.3, 0.25  # one sigma of the field's change over this share of the image width
 SHAPE_PRIOR = 2.0
 SHAPE_BOUNDS = (-2.0, 5.0)
 GAIN_PRIOR = 0.1
+READING_HALF_PX = 8.0  # of a source in the image: single columns of the sensor average out over it
 READING_FLOOR_K = 0.01  # what a field of low order leaves at a reference's place
 
 
@@ -113,11 +118,15 @@ class OverlapSystem:
     contacts: tuple[ContactRow, ...]
     reading_places: tuple[KnownField, ...] = ()
     correlated: float = 1.0
+    sensor: Pattern | None = None
+    sensor_columns: csr_matrix | None = None  # (N, Q) of it
 
     @property
     def layout(self) -> Layout:
         """Where the parameters stand."""
-        return Layout(self.n_groups, self.keep.shape[1])
+        return Layout(
+            self.n_groups, self.keep.shape[1], 0 if self.sensor_columns is None else self.sensor_columns.shape[1]
+        )
 
     @property
     def n_vertices(self) -> int:
@@ -132,28 +141,75 @@ class OverlapSystem:
         patterns = np.ascontiguousarray(self.patterns @ (self.keep.T @ keep))
         return replace(self, keep=keep, patterns=patterns, use_shape=use_shape)
 
+    def with_sensor(self, sensor: Pattern, u_px: NDArray, v_px: NDArray) -> OverlapSystem:
+        """The system with a sensor's pattern, at the rows' pixels u_px, v_px (N,)."""
+        return replace(self, sensor=sensor, sensor_columns=sensor.columns(u_px, v_px, self.group))
+
+    def part(self, rows: Bool) -> OverlapSystem:
+        """The system of some of its rows (N,) mask; vertices keep their numbers."""
+        vertex = self.vertex[rows]
+        start = np.insert(np.cumsum(np.bincount(vertex, minlength=self.n_vertices)), 0, 0).astype(np.int32)
+        columns = {k: getattr(self, k)[rows] for k in ("group", "y", "E", "D", "sigma2", "patterns", "gain_column")}
+        sensor = None if self.sensor_columns is None else self.sensor_columns[np.flatnonzero(rows)]
+        order = np.argsort(vertex, kind="stable").astype(np.int32)
+        return replace(self, vertex=vertex, order=order, start=start, sensor_columns=sensor, **columns)
+
+    def sample(self, solution: Solution, size: int) -> tuple[OverlapSystem, Solution, NDArray[np.intp]]:
+        """Some `size` of the vertices evenly, and those under contact thermometers, with their solution; and which rows
+        these are, (N',)."""
+        chosen = np.arange(self.n_vertices) % max(1, -(-self.n_vertices // size)) == 0
+        for contact in self.contacts:
+            chosen[contact.vertices] = True
+        rows = np.flatnonzero(chosen[self.vertex])
+        number = np.cumsum(chosen) - 1
+        part = self.part(chosen[self.vertex])
+        count = np.bincount(number[part.vertex], minlength=int(chosen.sum()))
+        part = replace(
+            part,
+            vertex=number[part.vertex].astype(np.int32),
+            start=np.insert(np.cumsum(count), 0, 0).astype(np.int32),
+            contacts=tuple(replace(c, vertices=number[c.vertices].astype(np.int32)) for c in self.contacts),
+            correlated=max(1.0, self.correlated * float(chosen.mean())),
+        )
+        return part, replace(solution, x=solution.x[chosen], weight=solution.weight[rows]), rows
+
     # ---------------------------------------------------------------- iteration
 
-    def solve(self) -> Solution:
-        """Iteratively reweighted least squares: Huber to a first estimate, weighted medians per vertex, then Tukey."""
+    def solve(self, start: Solution | None = None, steps: int = TUKEY_STEPS) -> Solution:
+        """Iteratively reweighted least squares: Huber to a first estimate, weighted medians per vertex, then Tukey.
+
+        start : of the same rows without the sensor's pattern; Tukey's weights go on from there, for some `steps`.
+        """
         at = self.layout
         p = np.zeros(at.size)
         columns = np.column_stack([self.patterns, np.zeros(len(self.y)), self.gain_column])
-        x = np.bincount(self.vertex, self.y) / np.diff(self.start)
-        weight, scale = self._robust(p, x, huber=True)
-        converged, n = False, 0
-        while not converged and n < HUBER_STEPS + TUKEY_STEPS:
+        if start is None:
+            x, n = np.bincount(self.vertex, self.y) / np.diff(self.start), 0
+        else:
+            p[: len(start.p)], x, n = start.p, start.x, HUBER_STEPS
+        weight, scale = self._robust(p, x, huber=n < HUBER_STEPS)
+        converged = False
+        while not converged and n < HUBER_STEPS + steps:
             n += 1
             before = p
-            p, x, covariance, normal, gain, variance = self._step(p, x, weight, columns)
+            p, x, covariance, normal, gain, variance = self._step(p, x, weight, columns, spread=self.sensor is None)
             change = np.abs(p - before)
             change[at.linear] /= self.slope_L
-            converged = n > HUBER_STEPS + 1 and bool(change.max() < CONVERGED_K)
+            change[at.sensor] /= self.slope_L
+            limit = CONVERGED_K if self.sensor is None else SENSOR_CONVERGED_K
+            converged = n > HUBER_STEPS + 1 and bool(change.max() < limit)
             if n == HUBER_STEPS:
                 x = self._medians(p)
             if not converged:
                 weight, scale = self._robust(p, x, huber=n < HUBER_STEPS)
+        if self.sensor is not None:
+            p, x, covariance, normal, gain, variance = self._step(p, x, weight, columns)
         return Solution(p, x, covariance * scale**2, normal, weight, scale, gain, variance, n, converged)
+
+    def step(self, p: Float, x: Float, weight: Float) -> tuple[Float, Float]:
+        """p (P,), x (V,) after one linear step with weights (N,) as they are."""
+        columns = np.column_stack([self.patterns, np.zeros(len(self.y)), self.gain_column])
+        return self._step(p, x, weight, columns, spread=False)[:2]
 
     def predict(self, p: Float, x: Float | float) -> Float:
         """The measurement equation for y, (N,) W m-2 sr-1, of parameters p (P,) and excesses x (V,), or one for all."""
@@ -164,6 +220,8 @@ class OverlapSystem:
             out += self.patterns @ p[at.field]
         if self.use_gain:
             out += p[at.gain] * self.gain_column
+        if self.sensor_columns is not None:
+            out += self.sensor_columns @ p[at.sensor]
         return out
 
     def _robust(self, p: Float, x: Float, *, huber: bool) -> tuple[Float, float]:
@@ -186,9 +244,12 @@ class OverlapSystem:
         half = np.searchsorted(w, 0.5 * (begin + total))
         return np.asarray(value[order][np.minimum(half, self.start[1:] - 1)])
 
-    def _step(self, p: Float, x: Float, w: Float, G: Float) -> tuple[Float, Float, Float, Float, Float, float]:
+    def _step(
+        self, p: Float, x: Float, w: Float, G: Float, *, spread: bool = True
+    ) -> tuple[Float, Float, Float, Float, Float, float]:
         """One Gauss-Newton step with x eliminated: p, x, covariance, normal matrix, dp/d(level), level variance.
 
+        spread : covariance and dp/d(level) are wanted; without them a large system is solved six times faster.
         G : (N, K + 2) derivatives by field, shape and gain; the shape's column is filled here.
         """
         at = self.layout
@@ -218,13 +279,27 @@ class OverlapSystem:
         N[at.shared, at.shared] = G.T @ wG
         rhs[at.offsets], rhs[at.shared] = by_group @ (w * y), wG.T @ y
 
+        if self.sensor_columns is not None:
+            X = self.sensor_columns
+            wX = X.multiply(w[:, None]).tocsr()
+            B[:, at.sensor] = (by_vertex @ X).toarray()
+            N[at.offsets, at.sensor] = (by_group @ wX).toarray()
+            N[at.shared, at.sensor] = (wX.T @ G).T
+            N[at.sensor, : at.sensor.start] = N[: at.sensor.start, at.sensor].T
+            N[at.sensor, at.sensor] = (X.T @ wX).toarray()
+            rhs[at.sensor] = wX.T @ y
+
         level = self._level(a, c, B)
-        N -= B.T @ (B / a[:, None])
+        if self.sensor_columns is None:
+            N -= B.T @ (B / a[:, None])
+        else:  # a product with its own transpose costs half
+            root = B / np.sqrt(a)[:, None]
+            N -= root.T @ root
         rhs -= B.T @ (c / a)
         N /= self.correlated
         rhs /= self.correlated
         self._add_priors(N, rhs)
-        p, covariance, level_gain = constrained_minimum(N, rhs, level.row, level.target)
+        p, covariance, level_gain = constrained_minimum(N, rhs, level.row, level.target, spread=spread)
         p[at.shape] = np.clip(p[at.shape], *SHAPE_BOUNDS)
         return p, (c - B @ p) / a, covariance, N, level_gain, level.variance
 
@@ -241,16 +316,18 @@ class OverlapSystem:
         N[at.field, at.field] += self.field_prior()
         N[at.shape, at.shape] += SHAPE_PRIOR**-2
         N[at.gain, at.gain] += GAIN_PRIOR**-2
+        if self.sensor is not None:
+            N[at.sensor, at.sensor] += self.sensor.precision() / self.slope_L**2
         if self.readings:
             level = self._mean_reading()
-            for reading, row, weight in self._reading_rows():
+            for reading, row, weight in self.reading_rows():
                 tilt, target = row - level.row, reading.measured - reading.expected - level.target
                 N += weight * np.outer(tilt, tilt)
                 rhs += weight * target * tilt
 
     # ---------------------------------------------------------------- the level
 
-    def _reading_rows(self) -> list[tuple[ExpectedReading, Float, float]]:
+    def reading_rows(self) -> list[tuple[ExpectedReading, Float, float]]:
         """Each reading with its derivative by the parameters and its weight."""
         at, out = self.layout, []
         for reading, group, place in zip(self.readings, self.reading_groups, self._places(), strict=True):
@@ -260,6 +337,10 @@ class OverlapSystem:
                 patterns = self.field.patterns(np.array([place.u_px]), np.array([place.v_px]))
                 row[at.field] = (patterns @ self.keep)[0]
             row[at.gain] = reading.expected - self.pivot if self.use_gain else 0.0
+            if self.sensor is not None:
+                dv, du = np.mgrid[-READING_HALF_PX:READING_HALF_PX:5j, -READING_HALF_PX:READING_HALF_PX:5j]
+                u, v = reading.u_px + du.ravel(), reading.v_px + dv.ravel()
+                row[at.sensor] = self.sensor.columns(u, v, np.full(du.size, reading.view)).mean(axis=0)
             out.append((reading, row, 1 / (reading.sigma_measured**2 + (READING_FLOOR_K * self.slope_L) ** 2)))
         return out
 
@@ -267,7 +348,7 @@ class OverlapSystem:
         return self.reading_places or tuple(KnownField(r.u_px, r.v_px) for r in self.readings)
 
     def _mean_reading(self) -> Level:
-        rows = self._reading_rows()
+        rows = self.reading_rows()
         w = np.array([weight for _, _, weight in rows])
         variance = 1 / w.sum() + max(r.sigma_expected for r in self.readings) ** 2
         w /= w.sum()
@@ -291,8 +372,12 @@ class OverlapSystem:
         return Level(np.concatenate([np.full(M, 1 / M), np.zeros(P - M)]), 0.0, 0.0)
 
 
-def constrained_minimum(N: Float, rhs: Float, row: Float, target: float) -> tuple[Float, Float, Float]:
+def constrained_minimum(
+    N: Float, rhs: Float, row: Float, target: float, *, spread: bool = True
+) -> tuple[Float, Float, Float]:
     """min ½pᵀNp - rhsᵀp under row·p = target: (p, covariance within the constraint's plane, dp/dtarget).
+
+    spread : False leaves the last two empty.
 
     Parameters differ by orders of magnitude: the system is scaled to a unit diagonal first.
     """
@@ -302,6 +387,9 @@ def constrained_minimum(N: Float, rhs: Float, row: Float, target: float) -> tupl
     kkt = np.zeros((P + 1, P + 1))
     kkt[:P, :P] = N * np.outer(d, d)
     kkt[:P, P] = kkt[P, :P] = r / norm
+    if not spread:
+        right = np.append(rhs * d, target / norm)
+        return d * solve(kkt, right, assume_a="sym", check_finite=False)[:P], np.zeros((0, 0)), np.zeros(0)
     inverse = np.linalg.inv(kkt)
     p = d * (inverse[:P, :P] @ (rhs * d) + inverse[:P, P] * (target / norm))
     return p, inverse[:P, :P] * np.outer(d, d), d * inverse[:P, P] / norm

@@ -23,6 +23,7 @@ EDGE_MARGIN_PX = 0.5  # fused surfaces shrink or swell by about this much of a t
 BILINEAR_VARIANCE = 4 / 9  # mean over sub-pixel positions of the noise variance left by bilinear sampling
 AIR_LOSS_PER_M = 0.006  # 1-τ of a metre of room air at 50 % humidity, 7.5-13.5 µm (62 mK at 10 K contrast)
 LINKED_EPSILON0_SIGMA = 0.003  # of ε(0) where it follows the fitted shape of a smooth surface
+ALONG_SURFACE = 2**-0.5  # share of a shift away from the body's middle that runs along its surface
 MAX_LEVER = 4.0  # bound on a normal error's lever near grazing, where the linear form no longer holds
 
 
@@ -33,8 +34,10 @@ class ErrorModel:
     netd_K : noise of a pixel. sigma_normal_deg : of the surface normal, per axis. sigma_shape : relative, of 1-E(θ),
     where it is not fitted. sigma_registration_px : of the thermal image on the surface. sigma_reflected_K : of the
     room's reflected temperature. gradient_K_per_m : temperature gradient along the surface, scalar or (V,).
-    sigma_emissivity0 : of ε(0). psf_sigma_px : point spread of the thermal image, which mixes room into skin at
-    silhouettes; edge_margin_px : how much nearer a silhouette may be than the mesh says.
+    sigma_emissivity0 : of ε(0). sigma_gain : of the camera's gain. sigma_depth_scale : of the depth camera's scale.
+    aligned_px : what the alignment left between the outlines, NaN = not measured. psf_sigma_px : point spread of the
+    thermal image, which mixes room into skin at silhouettes; edge_margin_px : how much nearer a silhouette may be than
+    the mesh says.
     """
 
     netd_K: float
@@ -43,9 +46,18 @@ class ErrorModel:
     sigma_registration_px: float
     sigma_reflected_K: float
     sigma_emissivity0: float
+    sigma_gain: float = 0.0
+    sigma_depth_scale: float = 0.0
+    aligned_px: float = float("nan")
     psf_sigma_px: float = DEFAULT_PSF_PX
     edge_margin_px: float = EDGE_MARGIN_PX
     gradient_K_per_m: float | Float32 = 0.0
+
+    @property
+    def registration_over(self) -> float:
+        """What the alignment left of the outlines over the stated registration error; 1 where it was not measured."""
+        known = np.isfinite(self.aligned_px) and self.sigma_registration_px > 0
+        return self.aligned_px / self.sigma_registration_px if known else 1.0
 
     @classmethod
     def of(cls, camera: ThermalCamera, settings: TemperatureSection) -> ErrorModel:
@@ -58,6 +70,8 @@ class ErrorModel:
             sigma_registration_px=settings.sigma_registration_px,
             sigma_reflected_K=settings.sigma_reflected_K,
             sigma_emissivity0=settings.sigma_emissivity0,
+            sigma_gain=settings.sigma_gain,
+            sigma_depth_scale=settings.sigma_depth_scale,
             psf_sigma_px=DEFAULT_PSF_PX if camera.psf_sigma_px is None else camera.psf_sigma_px,
         )
 
@@ -145,7 +159,10 @@ class Uncertainty:
         noise : of the pixels. calibration : offsets and field of the views. shape : of ε(θ), where it is not fitted.
         normals : of the surface. registration : thermal image on a temperature gradient. silhouette : room mixed in at
         the body's outline. air : differences in the air path. emissivity0, reflected : what errors of ε(0) and T_refl
-        do beyond their common shift. views : how far views disagree, for methods that do not calibrate them.
+        do beyond their common shift. gain : likewise. scale : of the depth, on a gradient. pattern : what
+        residuals still have in common by place in the image. views : how far views disagree, for methods that do
+        not calibrate them.
+        not_skin : emissivity of what is flagged as not skin.
     level_parts_K : reference, emissivity0, reflected: one number each. A relative result has no reference: its level is
         unknown beyond these.
     modes_K : (V, R) float32, what one sigma of each strong error of the calibration does, signed: parts_K's
@@ -211,7 +228,10 @@ class Budget:
 
     epsilon0 : 1 where nothing is corrected. absolute : the output is divided by ε(0), else normal-equivalent. slope_L,
     slope_reflected : dL/dT at skin's and at the room's temperature, W m-2 sr-1 K-1. shape_fitted : ε(θ)'s shape was
-    solved for; epsilon0_follows : ε(0) with it. reference_sigma_K : of the level, NaN without a reference.
+    solved for; epsilon0_follows : ε(0) with it. level_sigma_K : of the common level, NaN without a reference.
+    sigma_normal_deg : as the residuals show it. registration_over : the alignment's own residual over the stated one.
+    pattern_K : of what residuals still have in common by place in the image. gain_pivot_K : where an error of the gain
+    changes nothing; None: the gain was solved for.
     """
 
     errors: ErrorModel
@@ -221,9 +241,13 @@ class Budget:
     slope_reflected: float
     shape_fitted: bool
     epsilon0_follows: bool
-    reference_sigma_K: float
+    level_sigma_K: float
     air_K: float | None
     transmission_per_m: float
+    sigma_normal_deg: float
+    registration_over: float
+    pattern_K: float
+    gain_pivot_K: float | None
 
     @property
     def divisor(self) -> float:
@@ -232,17 +256,18 @@ class Budget:
 
 
 def vertex_uncertainty(
-    budget: Budget, levers: Levers, x: Float, T_K: Float, path_m: NDArray, views_K: NDArray | None
+    budget: Budget, levers: Levers, x: Float, T_K: Float, path_m: NDArray, radius_m: NDArray, views_K: NDArray | None
 ) -> tuple[dict[str, NDArray], dict[str, NDArray], NDArray]:
     """Errors of each vertex, K: (parts, signed effects of what is common, modes (V, R)), for `Uncertainty.of`.
 
     x : (V,) normal-equivalent excess, W m-2 sr-1. T_K : (V,) K. path_m : (V,) distance beyond the typical one, m.
-    views_K : (V,) spread of views that were not calibrated, K. The budget is that of docs/radiometry.md.
+    radius_m : (V,) distance from the body's middle, m. views_K : (V,) spread of views that were not calibrated, K. The
+    budget is that of docs/radiometry.md.
     """
     b, errors = budget, budget.errors
     scale = 1 / (b.slope_L * b.divisor)  # radiance of x -> K of the output
     zero = np.zeros(len(x))
-    normal = np.radians(errors.sigma_normal_deg)
+    normal = np.radians(b.sigma_normal_deg)
     # An error of a normal tilts the surface to some views and away from others: between coherent and independent.
     tilt = np.sqrt(0.5 * (levers.slope**2 + levers.slope_squared))
     reflected = 1 - levers.total / b.divisor  # dL_s/dL_r
@@ -258,17 +283,21 @@ def vertex_uncertainty(
         "calibration": np.sqrt((modes**2).sum(1)),
         "shape": zero if b.shape_fitted else scale * np.abs(x * levers.loss) * errors.sigma_shape,
         "normals": scale * np.abs(x) * tilt * normal,
-        "registration": np.asarray(errors.gradient_K_per_m) * levers.registration_m,
+        "registration": np.asarray(errors.gradient_K_per_m) * levers.registration_m * b.registration_over,
+        "scale": np.asarray(errors.gradient_K_per_m) * radius_m * errors.sigma_depth_scale * ALONG_SURFACE,
+        "pattern": zero + b.pattern_K,
         "silhouette": scale * np.abs(x) * levers.silhouette,
         "air": zero if b.air_K is None else np.abs(T_K - b.air_K) * air_loss * np.abs(path_m),
     }
     if views_K is not None:
         parts["views"] = np.nan_to_num(views_K)
     common = {
-        "reference": zero + np.nan_to_num(b.reference_sigma_K) / b.divisor,
+        "reference": zero + np.nan_to_num(b.level_sigma_K) / b.divisor,
         "emissivity0": scale * x / b.epsilon0 * sigma_epsilon0 if b.absolute else zero,
         "reflected": reflected * errors.sigma_reflected_K * b.slope_reflected / b.slope_L,
     }
+    if b.gain_pivot_K is not None:
+        common["gain"] = errors.sigma_gain * (T_K - b.gain_pivot_K)
     return parts, common, modes
 
 

@@ -1,0 +1,109 @@
+"""What a result says against its own model: patterns of the sensor, pixels, skin, pictures made for the eye."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.problems import errors, problem_of
+from support.synthetic_views import BAND, WIDTH, make_world
+
+from thermofusion.mapping.pixels import bad_pixels
+from thermofusion.physics.signal import SignalConverter
+from thermofusion.scans.check import _automatic_gain
+from thermofusion.temperature import crosscal
+from thermofusion.temperature.pattern import Pattern
+from thermofusion.types import Camera, ThermalCamera, ThermalStream
+
+SLOPE = float(BAND.d_radiance_dT(306.15))
+
+
+def solved(world, added_K=None):
+    rows = world.observations
+    if added_K is not None:
+        rows = replace(rows, radiance=rows.radiance + np.float32(SLOPE) * added_K(rows).astype(np.float32))
+    problem = problem_of(rows, world.n_vertices, world.n_views, errors=errors(netd_K=0.05, sigma_normal_deg=0.5))
+    return problem, crosscal.calibrate(problem)
+
+
+def test_a_clean_scan_gets_no_pattern():
+    _, c = solved(make_world(3, n_views=40))
+    assert c.sensor is None
+    assert c.criticism["left_out_views_better"] == {}
+    assert c.pattern_sigma_K == 0
+
+
+def test_columns_of_the_sensor_are_found_and_their_size_told():
+    column_K = 0.1 * np.random.default_rng(5).normal(size=WIDTH)
+    _, c = solved(make_world(3, n_views=40), lambda rows: column_K[np.rint(rows.u_px).astype(int)])
+    assert c.sensor is not None
+    assert list(c.criticism["left_out_views_better"]) == ["fixed"]
+    u = np.arange(60.0, WIDTH - 60)
+    found_K = c.sensor(u, np.full(len(u), 120.0), np.zeros(len(u), int)) / c.slope_L
+    true_K = column_K[60 : WIDTH - 60]
+    left = (found_K - found_K.mean()) - (true_K - true_K.mean())
+    assert np.std(left) < 0.4 * np.std(true_K)
+
+
+def test_hats_and_lines_are_partitions_of_one():
+    pattern = Pattern(WIDTH, 240, 0.1, 0.1, 0.1, 0.1, np.zeros(3, int), np.array([0.0, 0.5, 1.0]), np.zeros(0))
+    rng = np.random.default_rng(0)
+    u, v = rng.uniform(0, WIDTH - 1, 50), rng.uniform(0, 239, 50)
+    X = pattern.columns(u, v, np.full(50, 2))
+    assert X.shape[1] == len(pattern.precision())
+    # at the end of a stretch the straight rise is 1 and its bend 0; two grids of hats, columns and rows add one each
+    np.testing.assert_allclose(X @ np.ones(X.shape[1]), 5.0, atol=1e-9)
+
+
+def stream_of(images, netd_K=0.05):
+    h, w = images[0].shape
+    lens = Camera(w, h, np.array([[300.0, 0, w / 2], [0, 300.0, h / 2], [0, 0, 1]]))
+    n = len(images)
+    camera = ThermalCamera(lens, np.eye(4), netd_K=netd_K)
+    return ThermalStream(np.arange(n) * 0.2, images.__getitem__, ("",) * n, np.arange(n), np.ones(n, bool), camera)
+
+
+def scene(n=24, shape=(120, 160), seed=0):
+    """A warm disc that moves before a cold wall, with noise and columns of 0.1 K, °C."""
+    rng = np.random.default_rng(seed)
+    v, u = np.mgrid[: shape[0], : shape[1]]
+    columns = 0.1 * rng.normal(size=shape[1])
+    for k in range(n):
+        disc = np.hypot(u - 60 - k, v - 60) < 35
+        yield (22 + 11.0 * disc + columns + rng.normal(0, 0.05, shape)).astype(np.float32)
+
+
+@pytest.mark.parametrize("kind", ["stuck", "off", "blinking"])
+def test_bad_pixels_are_found_and_no_others(kind):
+    images, rng = list(scene()), np.random.default_rng(1)
+    at = [(30, 40), (61, 81), (100, 150), (5, 9)]
+    for k, image in enumerate(images):
+        for p in at:
+            if kind == "stuck":
+                image[p] = 60.0
+            elif kind == "off":
+                image[p] += 0.8
+            elif k % 2:
+                image[p] += rng.choice([-1, 1]) * 1.5
+    stream = stream_of(images)
+    found = bad_pixels(stream, np.arange(len(images)), SignalConverter(stream.camera))
+    assert {tuple(p) for p in np.argwhere(found)} == set(at)
+
+
+def test_a_good_sensor_has_no_bad_pixels():
+    stream = stream_of(list(scene(seed=4)))
+    assert not bad_pixels(stream, np.arange(24), SignalConverter(stream.camera)).any()
+
+
+def test_pictures_stretched_anew_in_every_frame_are_refused_and_eight_bits_alone_are_not():
+    images = list(scene(3, seed=2))
+    coarse = [np.round(image / 0.1).astype(np.uint16) for image in images]
+    assert not _automatic_gain(coarse)
+    stretched = []
+    for image in images:
+        lo, hi = np.percentile(image, [0.5, 99.5])
+        stretched.append(np.round(255 * np.clip((image - lo) / (hi - lo), 0, 1)).astype(np.uint16))
+    assert _automatic_gain(stretched)
+    moving = [np.round(s * (40 + k) + 7 * k).astype(np.uint16) for k, s in enumerate(stretched)]
+    assert _automatic_gain(moving)

@@ -1,0 +1,5 @@
+"""What the data say against the model: named faults, their size, what was done, and what a user can do."""
+
+from .diagnose import VOCABULARY, Diagnosis, diagnose
+
+__all__ = ["VOCABULARY", "Diagnosis", "diagnose"]

@@ -1,0 +1,134 @@
+"""Evidence of all steps into named faults, worst first."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import numpy as np
+
+from ..mapping.observe import Mapped
+from ..temperature.crosscal import Calibration
+from ..temperature.pattern import Pattern
+from ..temperature.solve import Temperature
+from ..types import VertexFlag
+
+OUTLINE_PX = 0.4  # clean scans leave 0.15-0.3 px between the outlines of model and image
+GRID = 24  # points along each side of the image at which a pattern's size is taken
+
+# What a diagnosis may be called, and what a user can do about it.
+VOCABULARY = MappingProxyType(
+    {
+        "pattern drifts between shutters": "let the camera warm up for 20 minutes, force a shutter every few "
+        "seconds, and keep the subject in the middle of the image",
+        "fixed pattern": "let the camera make a two-point correction before a black surface, and clean its window",
+        "readings agree by place in the image": "record more views in which the same skin crosses the whole image",
+        "surface that is not skin": "take off what can be taken off; its temperature is not the skin's",
+        "dead pixels": "have the camera's list of bad pixels renewed",
+        "outlines do not fit": "check the thermal clock, the rig and that nobody moved; repeat the scan more slowly",
+        "references contradict each other": "let references and camera warm up, and show them in more frames",
+    }
+)
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """One fault. size_K : its effect on readings, K; None where it has none that is known."""
+
+    what: str
+    evidence: str
+    size_K: float | None
+    where: str
+    done: str
+    advice: str = ""
+
+    def line(self) -> str:
+        """For the terminal."""
+        size = "" if self.size_K is None else f" ({self.size_K:.2f} K)"
+        return f"{self.what}{size}, {self.where}: {self.done}; {self.advice}"
+
+
+def diagnose(mapped: Mapped, temperature: Temperature, image_px: tuple[int, int]) -> tuple[Diagnosis, ...]:
+    """What is wrong with a scan, as its own data say; empty for a clean one. image_px : width and height."""
+    found: list[Diagnosis] = []
+    calibration = temperature.calibration
+    if calibration is not None:
+        found += _patterns(calibration)
+        found += _references(calibration)
+    other = (temperature.mesh.flags & VertexFlag.NOT_SKIN) > 0
+    if other.any():
+        T = temperature.mesh.temperature_degC
+        size = abs(float(np.nanmedian(T[other]) - np.nanmedian(T[~other])))
+        text = f"readings of {other.mean():.1%} of the surface change with the angle as skin's do not"
+        done = "flagged NOT_SKIN, kept out of calibration and statistics"
+        found.append(Diagnosis("surface that is not skin", text, size, "where the flag stands", done))
+    if len(mapped.bad_pixels):
+        share = len(mapped.bad_pixels) / (image_px[0] * image_px[1])
+        evidence = f"{len(mapped.bad_pixels)} pixels ({share:.2%}) stand outside their neighbours in frame after frame"
+        found.append(Diagnosis("dead pixels", evidence, None, "single pixels", "left out"))
+    if mapped.outline_px > OUTLINE_PX:
+        evidence = (
+            f"{mapped.outline_px:.2f} px between the outlines of model and image (clean scans: below {OUTLINE_PX})"
+        )
+        done = "the uncertainty of places on a slope of temperature grew with it"
+        found.append(Diagnosis("outlines do not fit", evidence, None, "at the body's outline", done))
+    found.sort(key=lambda d: -(d.size_K or 0.0))
+    return tuple(replace(d, advice=VOCABULARY[d.what]) for d in found)
+
+
+def _patterns(c: Calibration) -> list[Diagnosis]:
+    found = []
+    better, before = c.criticism.get("left_out_views_better", {}), c.criticism.get("before", {})
+
+    def evidence(names: tuple[str, ...], kind: str) -> str:
+        size = max((before[n][0] for n in names if n in before), default=0.0)
+        return f"residuals by {names[0]} agree by {1e3 * size:.0f} mK; left-out views {better[kind]:.0%} better with it"
+
+    if c.sensor is not None and "drift" in better:
+        size = _drift_rms(c.sensor) / c.slope_L
+        text, done = evidence(("place and time",), "drift"), "solved for; its uncertainty is in sigma"
+        where = "mostly towards the image's border"
+        found.append(Diagnosis("pattern drifts between shutters", text, size, where, done))
+    if c.sensor is not None and "fixed" in better:
+        size = _fixed_rms(c.sensor) / c.slope_L
+        columns = c.sensor.column_K > c.sensor.place_K
+        where = "columns of the image" if columns else "places of the image"
+        text, done = evidence(("place", "column", "row"), "fixed"), "solved for; its uncertainty is in sigma"
+        found.append(Diagnosis("fixed pattern", text, size, where, done))
+    if c.pattern_sigma_K > 0:
+        text = f"{c.pattern_sigma_K:.3f} K is left that no term explains"
+        done = "sigma grew by it"
+        found.append(Diagnosis("readings agree by place in the image", text, c.pattern_sigma_K, "in the image", done))
+    return found
+
+
+def _references(c: Calibration) -> list[Diagnosis]:
+    scatter = c.criticism.get("references_K")
+    if not scatter:
+        return []
+    text = f"readings of references scatter by {scatter:.2f} K about the solution, more than their noise"
+    return [Diagnosis("references contradict each other", text, scatter, "at the references", "the level's sigma grew")]
+
+
+def _grid(sensor: Pattern) -> tuple[np.ndarray, np.ndarray]:
+    v, u = np.mgrid[0:GRID, 0:GRID].reshape(2, -1) / (GRID - 1)
+    return u * (sensor.width_px - 1), v * (sensor.height_px - 1)
+
+
+def _drift_rms(sensor: Pattern) -> float:
+    """What a drift grows to until the next shutter: its rms over the image, mean of the stretches, W m-2 sr-1."""
+    drift = replace(sensor, place_K=0.0, column_K=0.0, row_K=0.0)
+    n = len(drift.precision())
+    drift = replace(drift, coefficients=sensor.coefficients[:n])
+    u, v = _grid(sensor)
+    last = np.append(np.flatnonzero(np.diff(sensor.stretch)), len(sensor.stretch) - 1)
+    return float(np.mean([np.std(drift(u, v, np.full(len(u), k))) for k in last]))
+
+
+def _fixed_rms(sensor: Pattern) -> float:
+    """Rms over the image of what stands still, W m-2 sr-1."""
+    fixed = replace(sensor, drift_K=0.0)
+    n = len(fixed.precision())
+    fixed = replace(fixed, coefficients=sensor.coefficients[len(sensor.coefficients) - n :])
+    v, u = np.mgrid[0 : sensor.height_px : 6, 0 : sensor.width_px].reshape(2, -1).astype(float)
+    return float(np.std(fixed(u, v, np.zeros(len(u), np.intp))))

@@ -1,0 +1,165 @@
+"""Whether a sensor's pattern is asked for: where residuals are alike by place in the image, and left-out views agree.
+
+The smooth field that stands still is always solved for. A pattern that is fixed, or drifts between shutters, enters
+only when residuals are alike beyond chance *and* beyond a floor in kelvin, and when views that were left out are
+predicted better with it by twice the standard error, each against the best alternative.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..robust import SIGMA_PER_MAD
+from ..types import Float, Observations
+from .criticism import Alike, left_out, statistics
+from .pattern import Pattern
+from .problem import ThermalProblem
+from .system import OverlapSystem, Solution
+
+SAMPLE = 2000  # vertices that criticism and judgement need
+FINAL_SAMPLE = 6000  # and a pattern's solution
+FLOOR_K = 0.004  # of agreement: clean scans stay below; scales with the camera's noise beyond 0.04 K
+FLOOR_NETD_K = 0.04
+MIN_Z = 5.0
+DRIFT_OVER_SIZE, FIXED_OVER_SIZE = (
+    6.0,
+    3.0,
+)  # amplitude of a pattern over the agreement that vertices' means leave of it
+LEFT_OVER_SIZE = 2.0  # error of a vertex over the agreement that is left
+JUMP_SIGMAS = 5.0  # a step of the offsets between views beyond this many of their usual steps is a shutter's
+MIN_STRETCH_VIEWS = 4
+FOLDS = 3
+SOLVE_STEPS = 6  # of reweighting: from the solution without a pattern
+CLIP_SIGMAS = 4.0  # left-out residuals count up to here
+MIN_GAIN_SE = 2.0  # standard errors by which left-out views must be predicted better
+
+
+@dataclass(frozen=True, eq=False)
+class Refinement:
+    """What was found of the sensor's pattern.
+
+    before, after : agreement of residuals by coordinate. better : share by which the left-out views' mean square falls
+    with each term that was kept. pattern : None where nothing was kept.
+    """
+
+    before: dict[str, Alike]
+    after: dict[str, Alike]
+    better: dict[str, float]
+    pattern: Pattern | None
+    system: OverlapSystem
+    solution: Solution
+    rows: Observations
+    floor_K: float
+
+    @property
+    def left_K(self) -> float:
+        """One sigma of what residuals still have in common by place in the image, where that is beyond chance."""
+        return LEFT_OVER_SIZE * max(a.size_K if _beyond_chance(a, self.floor_K) else 0.0 for a in self.after.values())
+
+
+def refine(problem: ThermalProblem, system: OverlapSystem, solution: Solution, rows: Observations) -> Refinement:
+    """The solution with the sensor's pattern, where residuals and left-out views ask for one.
+
+    system, rows : solved without a pattern.
+    """
+    width, whole = problem.lens.width_px, (system, solution, rows)
+    system, solution, chosen = system.sample(solution, SAMPLE)
+    rows = rows.select(chosen)
+    points = problem.points_m[rows.vertex]
+    before = statistics(left_out(system, solution, rows, points), width)
+    floor = FLOOR_K * max(1.0, problem.errors.netd_K / FLOOR_NETD_K)
+    judge = _Judge(problem, system, solution, rows)
+    kept, score, better, now = judge.bare, None, {}, before
+    while problem.settings.crosscal.vignetting and problem.settings.crosscal.offsets:
+        tried = {name: kept.grown(sizes) for name, sizes in _asked(now, floor).items() if name not in better}
+        if not tried:
+            break
+        score = judge.score(kept) if score is None else score
+        scores = {name: judge.score(pattern) for name, pattern in tried.items()}
+        best = min(scores, key=lambda name: float(np.nanmean(scores[name])))
+        gain = (score - scores[best])[np.isfinite(score)]
+        if not gain.mean() > MIN_GAIN_SE * gain.std(ddof=1) / np.sqrt(len(gain)):
+            break
+        better[best] = float(gain.mean() / np.nanmean(score))
+        kept, score = tried[best], scores[best]
+        system, solution = judge.solved(kept)
+        now = statistics(left_out(system, solution, rows, points), width)
+    if not better:
+        return Refinement(before, before, {}, None, *whole, floor)
+    system, solution, chosen = whole[0].sample(whole[1], FINAL_SAMPLE)
+    rows = whole[2].select(chosen)
+    system = system.with_sensor(kept, rows.u_px, rows.v_px)
+    solution = system.solve(solution, 2 * SOLVE_STEPS)
+    kept = replace(kept, coefficients=solution.p[system.layout.sensor])
+    return Refinement(before, now, better, kept, system, solution, rows, floor)
+
+
+def _beyond_chance(a: Alike, floor_K: float) -> bool:
+    return a.z > MIN_Z and a.size_K > floor_K
+
+
+def _asked(found: dict[str, Alike], floor_K: float) -> dict[str, dict[str, float]]:
+    """Terms that residuals ask for, beyond chance and the floor, with the amplitudes of their parts, K."""
+    size = {name: a.size_K if _beyond_chance(a, floor_K) else 0.0 for name, a in found.items()}
+    fixed = {f"{name}_K": FIXED_OVER_SIZE * size[name] for name in ("place", "column", "row") if size[name]}
+    drift = {"drift_K": DRIFT_OVER_SIZE * size["place and time"]} if size["place and time"] else {}
+    return {name: sizes for name, sizes in (("drift", drift), ("fixed", fixed)) if sizes}
+
+
+def _stretches(problem: ThermalProblem, system: OverlapSystem, solution: Solution) -> tuple[NDArray[np.intp], Float]:
+    """Number of each view's stretch between shutters, and 0 ... 1 the time since its start over the longest stretch."""
+    M, times = problem.n_views, problem.view_times_s
+    offsets = solution.p[system.layout.offsets]
+    starts = {0, *problem.restarts}
+    if len(offsets) == M and M > 2 * MIN_STRETCH_VIEWS:
+        seen = np.unique(system.group)
+        steps = np.diff(offsets[seen])
+        usual = SIGMA_PER_MAD * float(np.median(np.abs(steps - np.median(steps))))
+        starts |= set(seen[1:][np.abs(steps) > JUMP_SIGMAS * usual].tolist())
+    first = np.array(sorted(starts))
+    stretch = np.searchsorted(first, np.arange(M), side="right") - 1
+    since = times - times[first][stretch]
+    return stretch, since / max(float(since.max()), 1e-9)
+
+
+class _Judge:
+    """Left-out views, predicted by the others."""
+
+    def __init__(self, problem: ThermalProblem, system: OverlapSystem, solution: Solution, rows: Observations) -> None:
+        self._system, self._solution, self._rows = system, solution, rows
+        stretch, since = _stretches(problem, system, solution)
+        width, height = problem.lens.width_px, problem.lens.height_px
+        self.bare = Pattern(width, height, 0.0, 0.0, 0.0, 0.0, stretch, since, np.zeros(0))
+
+    def solved(self, pattern: Pattern) -> tuple[OverlapSystem, Solution]:
+        """All views with a pattern, or without where it is bare."""
+        if pattern.is_bare:
+            return self._system, self._solution
+        system = self._system.with_sensor(pattern, self._rows.u_px, self._rows.v_px)
+        return system, system.solve(self._solution, SOLVE_STEPS)
+
+    def score(self, pattern: Pattern) -> Float:
+        """(M',) mean square over its own sigma of each view's left-out residuals; a view's own offset is their median.
+
+        Readings keep the robust weight that the solution of all views gave them: one linear step a fold.
+        """
+        system, solution = self.solved(pattern)
+        numbers, view = np.unique(system.group, return_inverse=True)
+        out = np.full(len(numbers), np.nan)
+        for fold in range(FOLDS):
+            left = view % FOLDS == fold
+            train = system.part(~left)
+            p, x = train.step(solution.p, solution.x, solution.weight[~left])
+            known = np.bincount(train.vertex, minlength=system.n_vertices) > 1
+            mine = left & known[system.vertex]
+            test = system.part(mine)
+            p[test.group] = 0.0
+            residual, sigma = test.y - test.predict(p, x), np.sqrt(test.sigma2)
+            for k in np.unique(view[mine]):
+                of_view = test.group == numbers[k]
+                r = (residual[of_view] - np.median(residual[of_view])) / sigma[of_view]
+                out[k] = np.mean(np.minimum(np.abs(r), CLIP_SIGMAS) ** 2)
+        return out
