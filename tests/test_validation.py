@@ -22,7 +22,7 @@ from thermofusion.recipe import load_recipe
 from thermofusion.robust import Statistics, mad_sigma, weighted_quantile
 from thermofusion.scans import open_scan
 from thermofusion.temperature.references import ExpectedReading
-from thermofusion.temperature.room import Room
+from thermofusion.temperature.surroundings import Room
 from thermofusion.temperature.uncertainty import BILINEAR_VARIANCE
 from thermofusion.types import SurfaceMesh
 

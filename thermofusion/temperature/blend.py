@@ -23,7 +23,7 @@ from .criticism import patches
 from .crosscal import Calibration
 from .mean import Groups, RobustMean, Solved
 from .problem import ThermalProblem
-from .room import Room
+from .surroundings import Room
 from .uncertainty import (
     AngleTables,
     Budget,

@@ -15,8 +15,7 @@ from ..physics.equation import leaving_radiance
 from ..recipe import MappingSection, TemperatureSection
 from ..types import Bool, Camera, Float, Float32, Int, Observations, Scan, SurfaceMesh
 from .references import ContactReading, ExpectedReading, contact_readings, expected_readings
-from .room import Room, room_of
-from .surroundings import SurroundingsResult, surroundings
+from .surroundings import Room, SurroundingsResult, room_of, surroundings
 from .uncertainty import ErrorModel
 
 

@@ -21,8 +21,8 @@ from ..types import Bool, Float32, OutputMode, Scan, SharedErrors, SurfaceMesh, 
 from .blend import BlendResult, blend
 from .crosscal import Calibration, Overlap
 from .problem import ThermalProblem
-from .room import Room
 from .skin import not_skin
+from .surroundings import Room
 
 Sections = tuple[MappingSection, TemperatureSection]
 METHODS = ("nearest-view", "mean", "cos-resolution", "paper", "corrected-cos", "joint")

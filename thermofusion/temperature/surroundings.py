@@ -1,4 +1,4 @@
-"""What each vertex sees in reflection: the room, or the body itself (armpit, groin, between legs).
+"""The room round the subject, and what each vertex sees in reflection: that room, or the body itself (armpit, groin).
 
 Skin reflects diffusely at 10 µm, so the radiance L_r that reaches the camera by reflection is a cosine-weighted mean
 over the hemisphere above the vertex, L_r = (1 - F) L_room + F L_body, F the share that the body fills. Rays cast on the
@@ -20,13 +20,44 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from ..geometry.rays import Hits, RayScene, barycentric
-from ..types import Bool, Float, Float32, SurfaceMesh
+from ..physics.band import ZERO_DEGC_K
+from ..recipe import TemperatureSection
+from ..types import Bool, Environment, Float, Float32, SurfaceMesh
 
+DEFAULT_ROOM_DEGC = 23.0  # taken, and said, where neither scan nor recipe knows the reflected temperature
 SAMPLE_SPACING_M = 0.020  # of the vertices rays start from: F changes over centimetres
 DIRECTIONS = 96  # per sample: F to about 0.01, which is 3 mK on skin in a room 10 K colder
 OFFSET_M = 0.010  # rays start this far above the surface: beyond the mesh's noise (2-4 mm) with room to spare
 NEIGHBOURS = 4
 NORMAL_SCALE_M = 0.05  # opposite sides of a thin part are 2 x this apart when samples are interpolated
+
+
+@dataclass(frozen=True)
+class Room:
+    """Temperatures of what surrounds the subject, K, and what had to be assumed of them; air None: not budgeted."""
+
+    reflected_K: float
+    air_K: float | None
+    assumed: tuple[str, ...] = ()
+
+    def text(self) -> str:
+        """In a few words, for pictures."""
+        reflected = f"room {self.reflected_K - ZERO_DEGC_K:.1f} °C reflected{' (assumed)' if self.assumed else ''}"
+        return reflected if self.air_K is None else f"{reflected}, air {self.air_K - ZERO_DEGC_K:.1f} °C"
+
+
+def room_of(environment: Environment, settings: TemperatureSection) -> Room:
+    """Recipe over scan over the default; what had to be assumed is said."""
+    assumed = []
+    reflected = environment.reflected_degC if settings.reflected_degC is None else settings.reflected_degC
+    air = environment.air_degC if settings.air_degC is None else settings.air_degC
+    if reflected is None:
+        reflected = DEFAULT_ROOM_DEGC if air is None else air
+        assumed.append(
+            f"the reflected temperature is not known: {reflected:.1f} °C assumed (an error of 1 K costs 20 mK straight "
+            "on, 63 mK at 60°); measure it with crumpled foil"
+        )
+    return Room(reflected + ZERO_DEGC_K, (reflected if air is None else air) + ZERO_DEGC_K, tuple(assumed))
 
 
 @dataclass(frozen=True, eq=False)
