@@ -232,7 +232,10 @@ def test_total_is_the_sum_of_its_parts_and_modes_keep_the_covariance():
     total = np.sqrt(sum(p.astype(float) ** 2 for p in r.uncertainty.parts_K.values()))
     np.testing.assert_allclose(r.uncertainty.total_K, total, rtol=1e-5)
     assert set(r.uncertainty.level_parts_K) == {"reference", "emissivity0", "reflected"}
-    assert r.uncertainty.level_parts_K["reference"] == pytest.approx(0.03, rel=0.1)
+    assert calibration.reference_sigma_K == pytest.approx(0.03, rel=0.1)
+    # views' offsets err, too, and shift all vertices alike
+    assert calibration.reference_sigma_K < calibration.level_sigma_K < 1.1 * calibration.reference_sigma_K
+    assert r.uncertainty.level_parts_K["reference"] == pytest.approx(calibration.level_sigma_K / 0.98, rel=5e-3)
     assert r.uncertainty.level_parts_K["reflected"] == pytest.approx(0.02, abs=0.007)  # 20 mK a kelvin, straight on
     A = np.random.default_rng(0).normal(size=(6, 6))
     modes = covariance_modes(A @ A.T, 6)
@@ -257,6 +260,7 @@ def test_intervals_hold_what_they_promise():
             world.observations,
             world.n_vertices,
             world.n_views,
+            settings=TemperatureSection(sigma_normal_deg=1.5),  # as declared, whatever residuals say
             errors=believed,
             L_reflected=L_r,
             room=Room(believed_K, None),

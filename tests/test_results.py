@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from thermofusion.errors import ResourceError, ScanError
 from thermofusion.files.json import to_json
@@ -18,6 +19,7 @@ from thermofusion.progress import silent
 from thermofusion.recipe import load_recipe
 from thermofusion.results.artifacts import load_artifact, save_artifact
 from thermofusion.results.folder import load_mesh
+from thermofusion.results.frame import _toward_the_toes
 from thermofusion.results.nouns import OLD_NAMES, stored
 from thermofusion.results.stages import Stage, Stages
 from thermofusion.types import SurfaceMesh, Trajectory
@@ -211,3 +213,20 @@ def test_json_has_no_nan():
     assert to_json({"a": np.array([1.0, np.nan]), "b": (np.int32(3), float("inf"))}).split() == (
         ["{", '"a":', "[", "1.0,", "null", "],", '"b":', "[", "3,", "null", "]", "}"]
     )
+
+
+def test_feet_say_where_the_front_is_and_cut_legs_say_nothing():
+    """Legs of 10 cm across with feet of 26 cm, turned; then the same legs cut off at two heights."""
+    rng, turned = np.random.default_rng(0), Rotation.from_rotvec([0, 0, 0.7]).as_matrix()
+
+    def legs(bottom_m):
+        angle, height = rng.uniform(0, 2 * np.pi, 4000), rng.uniform(0, 1.6, 4000)
+        ring = np.stack([0.05 * np.cos(angle), 0.05 * np.sin(angle), height], 1)
+        return np.concatenate([ring[height > b] + [x, 0, 0] for x, b in zip((-0.12, 0.12), bottom_m, strict=True)])
+
+    feet = [rng.uniform([x - 0.05, -0.21, 0], [x + 0.05, 0.05, 0.07], (900, 3)) for x in (-0.12, 0.12)]
+    front = turned @ [0, -1, 0]
+    found = _toward_the_toes(np.concatenate([legs((0.05, 0.05)), *feet]) @ turned.T, np.array([0.0, 0, 1]))
+    assert found @ front / np.linalg.norm(found) > 0.99
+    for cut in ((0.3, 0.3), (0.2, 0.3), (0.1, 0.45)):
+        assert _toward_the_toes(legs(cut) @ turned.T, np.array([0.0, 0, 1])) is None

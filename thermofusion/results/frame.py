@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import label
 
 from ..export.axes import axes_of, axes_rotation, axes_text, view_axes
 from ..geometry.rigid import pose
@@ -17,6 +18,8 @@ WORLD = "world: the recording's, or the first tracked depth camera's, metres"
 MIN_STATURE_M = 1.2  # lower bodies show no feet, or no ankles above them
 FOOT_SHARE, ANKLE_SHARE = 0.05, 0.12  # of the stature: below the first lie the feet, between both the ankles
 MIN_TOE_M = 0.025  # feet reach this much farther forward than ankles
+MIN_FOOT_M = 0.17  # along that direction: a cut leg is round, and shorter
+FLOOR_CELL_M = 0.02  # of the grid on which feet that stand apart are told apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,13 +72,30 @@ def frame_of(scan: Scan, steps: Steps, output: OutputSection) -> Frame:
 
 
 def _toward_the_toes(vertices_m: Float, up: Float) -> Float | None:
-    """The level direction in which the feet reach beyond the ankles, (3,); None where no feet are seen standing."""
+    """The level direction in which the feet reach beyond their ankles, (3,); None where no foot is seen standing.
+
+    Whatever stands on the floor must be as long as a foot: legs that the image cuts off have no front.
+    """
     height = vertices_m @ up
     height -= height.min()
     stature = height.max()
-    foot, ankle = height < FOOT_SHARE * stature, (height >= FOOT_SHARE * stature) & (height < ANKLE_SHARE * stature)
-    if stature < MIN_STATURE_M or not foot.any() or not ankle.any():
+    if stature < MIN_STATURE_M:
         return None
-    reach = vertices_m[foot].mean(0) - vertices_m[ankle].mean(0)
-    reach -= (reach @ up) * up
-    return reach if np.linalg.norm(reach) > MIN_TOE_M else None
+    across = np.linalg.svd(up[None])[2][1:]  # (2, 3): two level directions
+    level = vertices_m @ across.T
+    low, foot = height < ANKLE_SHARE * stature, height < FOOT_SHARE * stature
+    cell = ((level[low] - level[low].min(0)) / FLOOR_CELL_M).astype(np.intp) + 1
+    ground = np.zeros(cell.max(0) + 2, bool)
+    ground[tuple(cell.T)] = True
+    legs, _ = label(ground, np.ones((3, 3)))
+    leg, foot, level = legs[tuple(cell.T)], foot[low], level[low]
+    reach = np.zeros(2)
+    for number in np.unique(leg[foot]):
+        toes, ankle = level[foot & (leg == number)], level[~foot & (leg == number)]
+        if not len(ankle):
+            continue
+        ahead = toes.mean(0) - ankle.mean(0)
+        length = np.ptp(toes @ ahead) / max(float(np.linalg.norm(ahead)), 1e-9)
+        if np.linalg.norm(ahead) > MIN_TOE_M and length > MIN_FOOT_M:
+            reach += ahead
+    return reach @ across if np.linalg.norm(reach) > MIN_TOE_M else None

@@ -273,8 +273,12 @@ def _assembled(blocks: list[_Block], oblique: Bool, problem: ThermalProblem, tas
 
 
 def _gain_pivot_K(problem: ThermalProblem, calibration: Calibration | None) -> float | None:
-    """The temperature at which an error of the gain changes nothing: the references', else the usual reading."""
-    if calibration is not None and calibration.gain != 1:
+    """The temperature at which an error of the gain changes nothing: the references', else the usual reading.
+
+    None: no error of the gain is to be budgeted.
+    """
+    solved = calibration is not None and calibration.gain != 1
+    if solved or not problem.errors.sigma_gain or not len(problem.observations):
         return None
     expected = [b.expected for b in problem.blackbodies] or [c.expected for c in problem.contacts]
     L = np.mean(expected) if expected else np.nanmedian(problem.observations.radiance)
