@@ -293,7 +293,7 @@ def _check_tiff(data: bytes, kind: str, place: object) -> None:
         text = f"the {kind} TIFF says it is to be turned or mirrored (orientation {pages[0].orientation}, tag 274)"
         raise ScanError(text, place=place, hint="write it as the camera's pixels lie, with orientation 1")
     if len(pages) > 1:
-        hint = "write one file a frame (`thermofusion import --thermal` reads many pages)"
+        hint = "write one file a frame (`thermofusion import DEPTH -o SCAN --thermal FILE` reads many pages)"
         raise ScanError(f"the {kind} TIFF holds more than one page", place=place, hint=hint)
 
 

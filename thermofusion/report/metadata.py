@@ -96,7 +96,7 @@ def _answers(scan: Scan) -> dict[str, str]:
     path = folder / FILE
     if not path.is_file():
         return {}
-    answers = validated(MetadataFile, read_json(path), path, "`thermofusion check --template` prints one").answers
+    answers = validated(MetadataFile, read_json(path), path, "`thermofusion check SCAN --template` prints one").answers
     return {k: _text(v) for k, v in answers.items() if v not in (None, "")}
 
 

@@ -212,7 +212,7 @@ def _check_calibrated(found: ThermalFrames, p: FlirParameters) -> None:
             f"the camera does not measure temperatures: its counts lie about the middle of 14 bits, its curve makes "
             f"{np.nanmedian(degC):.0f} degC of them",
             place=found.places[0],
-            hint="take a radiometric camera, or give it a curve by a blackbody series (`thermofusion thermal curve`)",
+            hint="take a radiometric camera, or one whose curve `thermofusion thermal curve READINGS.csv` has measured",
         )
 
 
