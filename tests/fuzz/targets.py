@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import json
 import shutil
+import struct
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import scipy.io
-from support import result_maker
+from support import foreign, result_maker
 from support import scan_maker as make
 
 from thermofusion.calibration.board.board import Board
@@ -39,7 +42,7 @@ from thermofusion.results.artifacts import load_artifact, load_note, save_artifa
 from thermofusion.scans import open_scan, with_rig
 from thermofusion.scans.check import verify
 from thermofusion.scans.native.write import write_scan
-from thermofusion.scans.thermal import flir
+from thermofusion.scans.thermal import flir, read_thermal
 
 RNG = np.random.default_rng(3)
 K = [[60.0, 0, 31.5], [0, 60, 23.5], [0, 0, 1]]
@@ -63,6 +66,9 @@ def targets(scratch: Path) -> Iterator[Target]:
     yield _folder("native", scratch, _native, _open_native, 8)
     for name, build in (("tum", _tum), ("redwood", _redwood), ("7-scenes", _seven_scenes), ("apc", _shelf)):
         yield _folder(name, scratch, build, _open_foreign, 2)
+    for name in ("record3d", "stray", "polycam", "rtabmap", "sens", "bop", "rs-convert", "ros"):
+        yield _folder(name, scratch, partial(_makers, name), _open_maker)
+    yield Target("frames", _frames(), _in_file(scratch / "frames", _read_frames), 3)
     yield _folder("fakenect", scratch, _fakenect, _open_foreign)
     yield Target("mkv", {"take.mkv": _mkv()}, _in_file(scratch / "mkv", _open_mkv), 2)
     yield Target("trajectory", {"t.txt": b"# time\n0 0 0 0 0 0 0 1\n0.5 0.1 0 0 0 0 0 1\n"},
@@ -164,7 +170,39 @@ def _flir() -> dict[str, bytes]:
 
 def _read_flir(path: Path) -> object:
     flir.recognise(path)
-    return flir.read_thermal_frames(path)
+    return _read_frames(path)
+
+
+def _frames() -> dict[str, bytes]:
+    """Thermal files of other makers, each as small as its layout allows."""
+    kelvin = RNG.integers(28000, 31000, (120, 160)).astype("<u2")
+    tjsn = {"metadata": {"Date": "1/1/26", "Time": "12:00:00.0"}, "radiometric": base64.b64encode(kelvin).decode()}
+    irg = struct.pack("<HHIHH", 0xACCA, 128, 192, 16, 12).ljust(128, b"\0") + bytes(192) + bytes(range(192)) * 2
+    table = np.linspace(280, 310, 256).astype("<f4").tobytes()
+    irb = b"\xffIRB\0".ljust(25, b"\0") + struct.pack("<ii", 64, 1)
+    irb = irb.ljust(64, b"\0") + struct.pack("<iiiii", 1, 0, 0, 96, 2208).ljust(32, b"\0")
+    irb += struct.pack("<HHHH", 2, 0, 16, 15).ljust(60, b"\0") + table + bytes(644) + bytes(range(240)) * 2
+    tiff = cv2.imencodemulti(".tiff", [np.full((6, 7), 20, np.float32)] * 2)[1].tobytes()
+    np.save(npy := io.BytesIO(), np.full((2, 3, 4), 21, np.float32))
+    csv = "Temperature [°C]\n21,5;22;23;24\n21;22;23,5;24\n".encode()
+    return {"a.tjsn": json.dumps(tjsn).encode(), "b.irg": irg, "c.irb": irb, "d.tiff": tiff, "e.npy": npy.getvalue(),
+            "f.csv": csv}  # fmt: skip
+
+
+def _read_frames(path: Path) -> object:
+    frames = read_thermal(path)
+    return [frames.apparent_degC(i) for i in range(len(frames))]
+
+
+def _makers(name: str, root: Path) -> None:
+    """A recording of another maker as the import tests write it, beside nothing else."""
+    shutil.rmtree(root)
+    foreign.WRITERS[name][0](root)
+
+
+def _open_maker(root: Path, name: str) -> None:
+    inside = [f for f in root.iterdir() if f.suffix in (".r3d", ".db", ".sens")]
+    _open_foreign(inside[0] if inside else root, name)
 
 
 def _mkv() -> bytes:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ...errors import ScanError
 from ...files.reading import MAX_PIXELS, claimed_size, decode_image, read_bytes
 from ...types import Camera, Float, Float32, Stream
-from ..common import ImageFiles, image_stream, make_stream
+from ..common import ImageFiles, image_stream, make_camera, make_stream
 from ..naming import Named
 from ..stated import Stated
 
@@ -50,7 +50,8 @@ class DepthLayout:
                 hint="a coloured or 8-bit picture of depth has lost its distances: export 16-bit depth",
             )
         if raw.dtype.kind == "f":
-            z = raw.astype(np.float32) * np.float32(self.unit_m)
+            with np.errstate(over="ignore", invalid="ignore"):  # damaged numbers are no depth
+                z = raw.astype(np.float32) * np.float32(self.unit_m)
             return np.where(np.isfinite(z) & (z > 0), z, np.float32(np.nan))
         none = np.isin(raw, NO_DEPTH)
         value = raw >> SHIFT_BITS if self.shifted or self.rotated else raw
@@ -123,7 +124,7 @@ def read_npy(data: bytes, place: object) -> NDArray:
     """An array of a .npy file, native byte order; objects are refused. Raises ScanError."""
     try:
         array = np.load(io.BytesIO(data), allow_pickle=False)
-    except (ValueError, EOFError, OSError, SyntaxError, MemoryError) as e:
+    except Exception as e:  # whatever NumPy makes of a damaged header
         raise ScanError(f"it cannot be read as NPY ({type(e).__name__})", place=place) from None
     if array.dtype.kind not in "fiu" or not 2 <= array.ndim <= 3 or array.size == 0:
         raise ScanError(f"it holds {array.dtype} with {array.ndim} axes, expected numbers (H, W)", place=place)
@@ -192,15 +193,15 @@ def color_camera(
     if size == (depth.width_px, depth.height_px):
         return depth, ("depth is taken as registered to colour (T_color_depth = identity)",)
     if scaled:
-        return resized(depth, size), ()
+        return resized(depth, size, named.files[0]), ()
     text = f"colour ({size[0]} x {size[1]} px) is left out: its camera is not known; a rig.json with cameras.color"
     return None, (f"{text} and extrinsics.T_color_depth brings it in",)
 
 
-def resized(camera: Camera, size: tuple[int, int]) -> Camera:
+def resized(camera: Camera, size: tuple[int, int], place: object) -> Camera:
     """The same view at another size (width, height) px, scaled as the programs do whose formats need it: plainly."""
     sx, sy = size[0] / camera.width_px, size[1] / camera.height_px
     K = camera.K.copy()
     K[0, 0], K[1, 1] = K[0, 0] * sx, K[1, 1] * sy
     K[0, 2], K[1, 2] = K[0, 2] * sx, K[1, 2] * sy
-    return Camera(*size, K, camera.distortion)
+    return make_camera(size[0], size[1], K, camera.distortion, place=place)

@@ -53,7 +53,7 @@ def read(path: Path, stated: Stated = NOTHING) -> Scan:
 def _read_database(path: Path, stated: Stated) -> Scan:
     try:
         rows = _query(path, f"{QUERY} ORDER BY stamp, Node.id")
-    except sqlite3.Error as e:
+    except (sqlite3.Error, UnicodeError, OverflowError) as e:
         raise ScanError(f"it is no RTAB-Map database that can be read ({e})", place=path) from None
     if not rows:
         raise ScanError("the database holds no depth images", place=path)

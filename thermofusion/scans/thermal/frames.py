@@ -86,7 +86,8 @@ def to_degC(stored: NDArray, signal: SignalCurve | None, place: object) -> Float
     if signal is None or signal.kind == "radiance":
         raise ScanError("the values have no curve to temperature", place=place)
     if signal.kind == "apparent_degC":
-        return stored.astype(np.float64)
+        with np.errstate(invalid="ignore"):  # a damaged NaN warns when it is widened
+            return stored.astype(np.float64)
     return counts_to_kelvin(signal, stored.astype(np.float64)) - ZERO_DEGC_K
 
 

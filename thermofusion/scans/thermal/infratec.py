@@ -37,7 +37,8 @@ def read(path: Path) -> ThermalFrames:
     try:
         start, count = struct.unpack_from("<ii", data, 25)
         blocks = [struct.unpack_from("<iiiii", data, start + 32 * k) for k in range(min(count, MAX_BLOCKS))]
-        images = [_image(data, offset, path) for kind, _, _, offset, size in blocks if kind == _IMAGE and size > 0]
+        with np.errstate(invalid="ignore", over="ignore"):  # damaged numbers
+            images = [_image(data, offset, path) for kind, _, _, offset, size in blocks if kind == _IMAGE and size > 0]
     except (struct.error, ValueError):
         raise ScanError("the IRB file is truncated or damaged", place=path, hint=COPY_AGAIN) from None
     if not images:

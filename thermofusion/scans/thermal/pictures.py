@@ -38,7 +38,8 @@ def read(path: Path, said: ThermalSaid) -> ThermalFrames:
             place=path,
             hint="8-bit and coloured pictures have lost their temperatures: export float TIFF or CSV in degC",
         )
-    images, signal = as_said(stack, said, path)
+    with np.errstate(invalid="ignore", over="ignore"):  # damaged numbers are no temperatures
+        images, signal = as_said(stack, said, path)
     places = tuple(f"{path}, frame {i}" if len(images) > 1 else str(path) for i in range(len(images)))
     shape = (images.shape[1], images.shape[2])
     return ThermalFrames(shape, lambda i: images[i], np.full(len(images), np.nan), places, signal, notes=notes)

@@ -48,8 +48,11 @@ def read(path: Path, said: ThermalSaid) -> ThermalFrames:
     if unit is not None and said.linear is None:
         gain, offset = _UNITS[unit]
         note = () if unit == "C" else (f"the table says °{unit}" if unit == "F" else "the table says kelvin",)
-        return one_frame((table * gain + offset).astype(np.float32), path, notes=note)
-    images, signal = as_said(table[None], said, path)
+        with np.errstate(invalid="ignore", over="ignore"):
+            degC = (table * gain + offset).astype(np.float32)
+        return one_frame(degC, path, notes=note)
+    with np.errstate(invalid="ignore", over="ignore"):  # damaged numbers are no temperatures
+        images, signal = as_said(table[None], said, path)
     return one_frame(images[0], path, signal)
 
 

@@ -24,7 +24,8 @@ def looks_like(values: NDArray) -> tuple[str, str] | None:
     finite = values[np.isfinite(values)].astype(np.float64)
     if finite.size == 0:
         return None
-    low, median = np.percentile(finite, [1, 50])
+    with np.errstate(over="ignore", invalid="ignore"):  # damaged numbers look like nothing
+        low, median = np.percentile(finite, [1, 50])
     for step_K, name in STEPS_K.items():
         if ROOM_K[0] <= median * step_K <= ROOM_K[1] and low > 0:
             return name, f"--gain {step_K:g} --offset-degC -273.15" if step_K != 1 else "--offset-degC -273.15"

@@ -7,12 +7,12 @@ from numpy.typing import NDArray
 
 from ....types import Float
 
-OPENGL = np.diag([1.0, -1, -1, 1])  # axes of ARKit's camera (y up, looking along -z) in ours
-
 
 def from_opengl(T: NDArray) -> Float:
-    """Poses T_world_camera (N, 4, 4) m of ARKit's camera axes as poses of ours."""
-    return np.asarray(T, np.float64) @ OPENGL
+    """Poses T_world_camera (N, 4, 4) m of ARKit's camera axes (y up, looking along -z) as poses of ours."""
+    out = np.array(T, np.float64)
+    out[..., :3, 1:3] *= -1
+    return out
 
 
 def trusted(depth: NDArray, confidence: NDArray | None) -> NDArray:

@@ -41,7 +41,7 @@ def read(path: Path, stated: Stated = NOTHING) -> Scan:
     trees = [read_json(cameras / f"{s}.json") for s in stamps]
     color = _camera(trees[0], cameras / f"{stamps[0]}.json")
     shape = read_image(files[stamps[0]], kind="depth").shape
-    camera = stated.camera("depth") or resized(color, (shape[1], shape[0]))
+    camera = stated.camera("depth") or resized(color, (shape[1], shape[0]), path)
     times, layout = np.array(stamps) * 1e-6, DepthLayout(stated.unit_m(0.001))
     T = from_opengl(np.stack([_pose(t, cameras / f"{s}.json") for t, s in zip(trees, stamps, strict=True)]))
 

@@ -6,7 +6,6 @@ camera. LZFSE is decoded by `liblzfse` where it is installed; blocks that are st
 
 from __future__ import annotations
 
-import json
 import struct
 import zipfile
 from pathlib import Path
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ....errors import ScanError
-from ....files.reading import COPY_AGAIN, MAX_FILE_BYTES, decode_image
+from ....files.reading import COPY_AGAIN, MAX_FILE_BYTES, decode_image, parse_json
 from ....files.tum import poses_to_trajectory
 from ....types import Scan
 from ...common import make_camera, make_rig, make_stream
@@ -44,7 +43,7 @@ def read(path: Path, stated: Stated = NOTHING) -> Scan:
     except (KeyError, TypeError, ValueError):
         raise ScanError("'metadata' lacks w, h, dw, dh, K or poses", place=path) from None
     n, layout = len(times), DepthLayout(stated.unit_m(1.0))
-    camera = stated.camera("depth") or resized(color, size)
+    camera = stated.camera("depth") or resized(color, size, path)
     T = np.tile(np.eye(4), (len(rows), 1, 1))
     T[:, :3, :3], T[:, :3, 3] = Rotation.from_quat(rows[:, :4]).as_matrix(), rows[:, 4:]
     places = [f"{path}, frame {i}" for i in range(n)]
@@ -73,10 +72,7 @@ def read(path: Path, stated: Stated = NOTHING) -> Scan:
 
 
 def _metadata(path: Path) -> Any:
-    try:
-        return json.loads(_member(path, "metadata"))
-    except ValueError:
-        raise ScanError("'metadata' is not valid JSON", place=path) from None
+    return parse_json(_member(path, "metadata").decode("utf-8", "replace"), f"{path}: metadata")
 
 
 def _member(path: Path, name: str, *, needed: bool = True) -> bytes:

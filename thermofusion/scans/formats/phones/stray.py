@@ -42,7 +42,7 @@ def read(path: Path, stated: Stated = NOTHING) -> Scan:
     capture = _open(video) if video.is_file() else None
     size = _size(capture) if capture is not None else (round(2 * K[0, 2]), round(2 * K[1, 2]))
     color = make_camera(size[0], size[1], K, place=path / "camera_matrix.csv")
-    camera = stated.camera("depth") or resized(color, (shape[1], shape[0]))
+    camera = stated.camera("depth") or resized(color, (shape[1], shape[0]), path)
     layout = DepthLayout(stated.unit_m(0.001))
 
     def load(i: int) -> NDArray:

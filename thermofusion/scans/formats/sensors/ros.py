@@ -7,7 +7,7 @@ its encoding (REP 118: 16UC1 millimetres, 32FC1 metres), its place on the rig th
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Lock
@@ -115,24 +115,38 @@ def read(path: Path, stated: Stated = NOTHING) -> Scan:
 
 def _open(path: Path) -> Any:
     try:
-        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise ScanError("ROS bags are read through `rosbags`, which is not installed", place=path, hint=HINT) from None
     try:
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
-    except (AnyReaderError, OSError, ValueError, KeyError, AssertionError) as e:
+    except Exception as e:  # YAML's, sqlite's, mcap's, rosbags' own
         text = str(e).splitlines()[0] if str(e) else type(e).__name__
         raise ScanError(f"the bag cannot be opened ({text})", place=path, hint=COPY_AGAIN) from None
     return reader
 
 
+def _messages(reader: Any, connection: Any, **span: int) -> Iterator[tuple[int, Any]]:
+    """(log time in ns, message) of a topic. What the libraries say of a damaged bag becomes a ScanError."""
+    found = reader.messages(connections=[connection], **span)
+    while True:
+        try:
+            _, at, raw = next(found)
+            message = reader.deserialize(raw, connection.msgtype)
+        except StopIteration:
+            return
+        except Exception as e:  # sqlite's, mcap's, rosbags' own
+            text = f"the bag is damaged at {connection.topic} ({type(e).__name__})"
+            raise ScanError(text, place=reader.paths[0], hint=COPY_AGAIN) from None
+        yield at, message
+
+
 def _topic(reader: Any, connection: Any) -> _Topic | None:
     """The topic's times and encoding; None for an empty one. Messages without a stamp of their own take the log's."""
     log, stamps, first = [], [], None
-    for _, at, raw in reader.messages(connections=[connection]):
-        message = reader.deserialize(raw, connection.msgtype)
+    for at, message in _messages(reader, connection):
         first = first or message
         stamp = message.header.stamp
         stamps.append((stamp.sec, stamp.nanosec) if stamp.sec or stamp.nanosec else divmod(at, 10**9))
@@ -168,9 +182,9 @@ def _loader(reader: Any, topic: _Topic, path: Path) -> Callable[[int], NDArray]:
     def load(i: int) -> NDArray:
         at = topic.log_ns[i]
         with _ONE_AT_A_TIME:
-            found = [raw for _, _, raw in reader.messages(connections=[topic.connection], start=at, stop=at + 1)]
+            found = [m for _, m in _messages(reader, topic.connection, start=at, stop=at + 1)]
         if found:
-            return _image(reader.deserialize(found[0], topic.connection.msgtype), f"{path}, {topic.name} {i}")
+            return _image(found[0], f"{path}, {topic.name} {i}")
         raise ScanError(f"image {i} of {topic.name} cannot be found again", place=path)
 
     return load
@@ -201,8 +215,8 @@ def _cameras(reader: Any) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for c in reader.connections:
         if c.msgtype.endswith("CameraInfo"):
-            for _, _, raw in reader.messages(connections=[c]):
-                found[c.topic.rsplit("/", 1)[0]] = reader.deserialize(raw, c.msgtype)
+            for _, message in _messages(reader, c):
+                found[c.topic.rsplit("/", 1)[0]] = message
                 break
     return found
 
@@ -232,8 +246,8 @@ def _static(reader: Any) -> dict[tuple[str, str], Float]:
     found: dict[tuple[str, str], Float] = {}
     for c in reader.connections:
         if c.topic.endswith("tf_static"):
-            for _, _, raw in reader.messages(connections=[c]):
-                for t in reader.deserialize(raw, c.msgtype).transforms:
+            for _, message in _messages(reader, c):
+                for t in message.transforms:
                     p, q = t.transform.translation, t.transform.rotation
                     R = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
                     ends = (t.header.frame_id.strip("/"), t.child_frame_id.strip("/"))

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ....errors import ScanError
 from ....files.reading import COPY_AGAIN, MAX_PIXELS, decode_image, open_regular
 from ....files.tum import poses_to_trajectory
+from ....geometry.rigid import invert
 from ....types import Float, Scan
 from ...common import make_camera, make_rig, make_stream
 from ...stated import NOTHING, Stated
@@ -52,7 +53,7 @@ def read(path: Path, stated: Stated = NOTHING) -> Scan:
             if version != VERSION or length > 4096:
                 raise ScanError(f"a .sens file of version {version}, expected {VERSION}", place=path)
             f.read(length)
-            K_color, E_color, K_depth, E_depth = np.frombuffer(f.read(256), "<f4").reshape(4, 4, 4).astype(np.float64)
+            K_color, E_color, K_depth, E_depth = _doubles(f.read(256)).reshape(4, 4, 4)
             codecs = struct.unpack("<ii", f.read(8))
             cw, ch, dw, dh, steps, n = struct.unpack("<IIIIfQ", f.read(28))
         except (struct.error, ValueError):
@@ -90,7 +91,7 @@ def read(path: Path, stated: Stated = NOTHING) -> Scan:
         name=path.stem,
         root=path,
         format="sens",
-        rig=make_rig(camera, color, np.linalg.inv(E_color) @ E_depth if colored else None, place=path),
+        rig=make_rig(camera, color, invert(E_color) @ E_depth if colored else None, place=path),
         depth=make_stream(times, depth, places, place=path, kind="depth"),
         color=make_stream(times, picture, places, place=path, kind="color") if colored else None,
         trajectory=None if T is None else poses_to_trajectory(times[tracked], T, place=path),
@@ -106,7 +107,7 @@ def _frames(f: BinaryIO, n: int, size: int) -> list[_Frame]:
         head = f.read(96)
         if len(head) < 96:
             break
-        pose = np.frombuffer(head, "<f4", 16).reshape(4, 4).astype(np.float64)
+        pose = _doubles(head[:64]).reshape(4, 4)
         color_us, depth_us, color_bytes, depth_bytes = struct.unpack_from("<QQQQ", head, 64)
         at = f.tell()
         end = at + color_bytes + depth_bytes
@@ -115,6 +116,12 @@ def _frames(f: BinaryIO, n: int, size: int) -> list[_Frame]:
         frames.append(_Frame(pose, (depth_us or color_us) * 1e-6, (at, color_bytes), (at + color_bytes, depth_bytes)))
         f.seek(end)
     return frames
+
+
+def _doubles(data: bytes) -> Float:
+    """Float32 numbers (N,) as float64; damaged ones stay what they are, without a warning."""
+    with np.errstate(invalid="ignore"):
+        return np.frombuffer(data, "<f4").astype(np.float64)
 
 
 def _part(path: Path, where: tuple[int, int]) -> bytes:
