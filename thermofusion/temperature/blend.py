@@ -249,7 +249,7 @@ def _assembled(blocks: list[_Block], oblique: Bool, problem: ThermalProblem, tas
     parts = {k: whole([b.parts_K[k] for b in blocks], np.float32) for k in blocks[0].parts_K}
     own_K2 = column("own_K2", np.float32)
     if parts and task.settings.method == "joint":
-        parts["noise"] = _own_noise(parts["noise"], own_K2, problem.points_m)
+        parts["noise"] = _own_noise(parts["noise"], parts["normals"], own_K2, problem.points_m)
     T_K = column("absolute_K")
     if parts and problem.other is not None:
         unknown = OTHER_EPSILON_SIGMA * np.abs(T_K - problem.room.reflected_K)
@@ -278,19 +278,21 @@ def _gain_pivot_K(problem: ThermalProblem, calibration: Calibration | None) -> f
     None: no error of the gain is to be budgeted.
     """
     solved = calibration is not None and calibration.gain != 1
-    if solved or not problem.errors.sigma_gain or not len(problem.observations):
+    if solved or not problem.errors.sigma_gain:
         return None
     expected = [b.expected for b in problem.blackbodies] or [c.expected for c in problem.contacts]
+    if not expected and not np.isfinite(problem.observations.radiance).any():
+        return None
     L = np.mean(expected) if expected else np.nanmedian(problem.observations.radiance)
     return float(problem.band.temperature_K(L))
 
 
-def _own_noise(noise_K: Float32, own_K2: Float32, points_m: Float32) -> Float32:
-    """Noise (V,) K at points_m (V, 3), but no smaller than what the rows of their patch say, own_K2 (V,) K²."""
+def _own_noise(noise_K: Float32, normals_K: Float32, own_K2: Float32, points_m: Float32) -> Float32:
+    """Noise (V,) K at points_m (V, 3), or what rows of their patch say, own_K2 (V,) K², beyond normals_K (V,) K."""
     number, _ = patches(points_m, PATCH_M)
     known = np.isfinite(own_K2)
     mean = np.bincount(number, np.where(known, own_K2, 0)) / np.maximum(np.bincount(number, known), 1)
-    return np.sqrt(np.maximum(noise_K**2, mean[number])).astype(np.float32)
+    return np.sqrt(np.maximum(noise_K**2, mean[number] - normals_K**2)).astype(np.float32)
 
 
 # ---------------------------------------------------------------- which observations count
