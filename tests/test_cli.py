@@ -71,6 +71,7 @@ def test_a_result_folder_is_complete(demo):
     views = {f"views/{v}.png" for v in ("front", "back", "left", "right", "overview", "uncertainty", "residual")}
     assert names == {
         *("mesh.ply", "mesh.glb", "mesh.vtp", "trajectory.txt", "result.json", "result.npz", "recipe.resolved.toml"),
+        "report.html",
         *views,
     }
     assert Recipe.model_validate(tomllib.loads((out / "recipe.resolved.toml").read_text())).name == "torso"
