@@ -198,8 +198,9 @@ def _shifted(scan: Scan, trajectory: Trajectory, at: int, shift: int) -> Traject
     """From depth frame `at` on every pose belongs to the frame `shift` later (missing lines) or earlier."""
     t, own = scan.depth.times_s, trajectory.times_s
     later = own >= t[at] - SAME_TIME_S
-    frame = np.clip(np.searchsorted(t, own - SAME_TIME_S), 0, len(t) - 1) + shift
-    kept = ~later | ((frame < len(t)) & (frame >= at))
+    nearest = np.clip(np.searchsorted(t, own - SAME_TIME_S), 0, len(t) - 1)
+    frame, of_a_frame = nearest + shift, np.abs(t[nearest] - own) <= SAME_TIME_S  # others' frames are lost
+    kept = ~later | (of_a_frame & (frame < len(t)) & (frame >= at))
     times = np.where(later, t[np.clip(frame, 0, len(t) - 1)], own)
     return Trajectory(times[kept], trajectory.T_world_depth[kept])
 
