@@ -158,7 +158,7 @@ def test_export_writes_the_folder(tmp_path):
     assert {p.name for p in paths} == {"mesh.ply", "mesh.glb", "mesh.vtp", "mesh.csv"}
     assert sorted(p.name for p in (tmp_path / "a/b").iterdir()) == sorted(p.name for p in paths)
     assert_same(read_mesh(tmp_path / "a/b"), mesh)
-    for arguments in ({"formats": ["obj"]}, {"palette": "jet"}, {"range_degC": (36.0, 30.0)}):
+    for arguments in ({"formats": ["fbx"]}, {"palette": "jet"}, {"range_degC": (36.0, 30.0)}):
         with pytest.raises(RecipeError):
             export(mesh, tmp_path, **arguments)
     with pytest.raises(ScanError, match="no mesh format"):

@@ -40,7 +40,7 @@ seen.picks = await page.evaluate(() => {
     if (!p) continue;
     const px = [...g.getImageData(Math.floor(x * ratio), Math.floor(y * ratio), 1, 1).data];
     const near = [[-3, 0], [3, 0], [0, -3], [0, 3]].map(([dx, dy]) => t.pick(x + dx, y + dy));
-    const inner = near.every((q) => q && Number.isFinite(q.temperature) && Math.hypot(...q.point.map((v, k) => v - p.point[k])) < 0.05);
+    const inner = near.every((q) => q && Number.isFinite(q.temperature) && Math.hypot(...q.point.map((v, k) => v - p.point[k])) < 0.008); // no outline in between
     const times = performance.now();
     t.pick(x, y);
     out.push({ ray: t.ray(x, y), temperature: p.temperature, point: p.point, rgb: px.slice(0, 3), inner, ms: performance.now() - times });

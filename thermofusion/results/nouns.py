@@ -62,7 +62,8 @@ def stored() -> MappingProxyType[str, type]:
             "signal-curve/1": SignalCurve,
             "surface-mesh/1": SurfaceMesh,
             "surface/1": SurfaceResult,
-            "temperature/1": Temperature,
+            "temperature/2": Temperature,
+            "temperature/1": Temperature,  # without `shared`
             "thermal-camera/1": ThermalCamera,
             "thermal-mesh/2": ThermalMesh,
             "thermal-mesh/1": ThermalMesh,  # without `residual`

@@ -307,6 +307,9 @@ function decorate() {
   const right = body.camera.matrixWorld.elements[0];
   $("side-right").textContent = right > 0.35 ? "L" : right < -0.35 ? "R" : "";
   $("side-left").textContent = right > 0.35 ? "R" : right < -0.35 ? "L" : "";
+  $("stage").classList.toggle("two", state.beside >= 0);
+  $("stage").dataset.left = $("side-left").textContent;
+  $("stage").dataset.right = $("side-right").textContent;
   const length = [0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1].find((m) => m * body.pxPerM > 60) ?? 1;
   $("ruler").querySelector("i").style.width = `${length * body.pxPerM}px`;
   $("ruler").querySelector("span").textContent = length < 0.01 ? `${length * 1e3} mm` : `${+(length * 100).toFixed(0)} cm`;
