@@ -36,8 +36,10 @@ def temperature():
     T = np.where(mesh.measured, 33 + 3 * z + 0.6 * np.sin(40 * x) * np.cos(30 * z), np.nan).astype(np.float32)
     noise = np.where(mesh.measured, 0.03 + 0.05 * np.abs(x), np.nan)
     parts = {"noise": noise, "normals": noise, "registration": noise / 2, "air": noise / 3, "calibration": noise / 3}
-    mesh = type(mesh)(**{**vars(mesh), "temperature_degC": T, "apparent_degC": T - 0.5 - np.abs(x), "anchored": True,
-                         "uncertainty_parts": parts, "observations": np.where(mesh.measured, 9, 0)})  # fmt: skip
+    flags = mesh.flags | np.where((z > 0.08) & (x > 0.03), 64, 0).astype(np.uint8)  # not skin
+    mesh = type(mesh)(**{**vars(mesh), "flags": flags, "temperature_degC": T, "apparent_degC": T - 0.5 - np.abs(x),
+                         "anchored": True, "uncertainty_parts": parts,
+                         "observations": np.where(mesh.measured, 9, 0)})  # fmt: skip
     effects = {"reference": np.full(len(T), 0.03), "emissivity0": 0.02 + 0.01 * z, "calibration 1": 0.03 * x}
     shared = SharedErrors.of({k: np.where(mesh.measured, v, np.nan) for k, v in effects.items()}, 400.0, 0.025)
     return Temperature(mesh, T, T, mesh.apparent_degC, shared=shared, level_sigma_K={"reference": 0.03})
@@ -48,7 +50,7 @@ def document(name="egg"):
         "scan": {"name": name, "recorded_at": "2026-05-04"},
         "quality": {"failed": []},
         "messages": [name],
-        "diagnosis": [{"sentence": name, "evidence": 3.2}],
+        "diagnosis": [{"what": name, "size_K": 3.2, "where": "", "done": "", "evidence": name}],
         "metadata": [{"key": "a", "what": "asked", "tisem": 1, "value": name, "source": "x"},
                      {"key": "b", "what": "asked too", "tisem": 2, "value": None, "source": None}],
         "radiometry": [{"what": "number", "value": name, "source": "x"}],

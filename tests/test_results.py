@@ -67,7 +67,7 @@ def test_only_our_own_nouns_are_stored(tmp_path):
         "thermofusion.files.whole:write_text",
         "thermofusion.results.nouns:class_of",
         "thermofusion.planted:Noun",
-        "temperature/2",
+        "temperature/9",
         "os:system",
         {"a": 1},
         7,

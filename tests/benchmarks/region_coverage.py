@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +60,7 @@ def main() -> None:
             found.append((float(patch.mean(np.nan_to_num(error))), errors))
     share = lambda z: f"{np.mean(np.abs(z) < 1.96):.1%}"  # noqa: E731
     relative = np.array([(e - level) / s.sigma_K for e, s in found])
-    apart = [(a - b) / s.minus(t) for (a, s), (b, t) in zip(found, found[1:], strict=False)]
+    apart = [(a - b) / s.minus(t) for (a, s), (b, t) in pairwise(found)]
     print(f"{len(found)} regions: {share(relative)} about the common level, rms of error/sigma {relative.std():.2f}")
     print(f"differences: {share(np.array(apart))}")
     if mesh.anchored:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ..types import Float, SharedErrors, ThermalMesh
+from ..types import Bool, Float, SharedErrors, ThermalMesh, VertexFlag
 from .body import Body, along
 from .errors import MeanErrors, VertexErrors
 from .patch import Patch, patch_of
@@ -31,9 +31,9 @@ class Reading:
 
     value_degC : a spot's temperature, else the mean over the measured area or along the line; NaN = nothing measured.
     sigma_K : one sigma about the level common to the body; sigma_absolute_K : on an absolute scale, NaN for a relative
-    result. sd_K, min_degC, max_degC, n : of the vertices inside. area_cm2 : measured or not; measured_fraction : of it.
-    length_mm : over the surface. profile : a line's columns (N,). volume_cm3 : between a slab's planes, or above the
-    membrane that a region's border spans (a swelling). errors : for differences.
+    result. sd_K, min_degC, max_degC, n : of the vertices inside. area_cm2 : measured or not; measured_fraction : of it,
+    less what is flagged as no skin. length_mm : over the surface. profile : a line's columns (N,). volume_cm3 : between
+    a slab's planes, or above the membrane that a region's border spans (a swelling). errors : for differences.
     """
 
     name: str
@@ -136,6 +136,11 @@ class Measurer:
         return VertexErrors.of(self.mesh, self.shared, self.body)
 
     @cached_property
+    def _skin(self) -> Bool:
+        """(V,) what means are taken over: measured, and not told to be cloth or hair."""
+        return self.mesh.measured & ((self.mesh.flags & VertexFlag.NOT_SKIN) == 0)
+
+    @cached_property
     def _T(self) -> Float:
         return self.mesh.temperature_degC.astype(np.float64)
 
@@ -145,7 +150,7 @@ class Measurer:
             return self._spot(region)
         if isinstance(region, Line):
             return self._line(region)
-        patch = patch_of(region, self.body, self.mesh.measured)
+        patch = patch_of(region, self.body, self._skin)
         volume = slab_volume(region, self.body) if isinstance(region, Slab) else swelling_volume(region, self.body)
         size: dict[str, Any] = {
             "volume_cm3": volume[0] * 1e6,

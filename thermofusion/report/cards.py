@@ -96,15 +96,12 @@ def _list(texts: Iterable[object]) -> str:
 
 
 def _diagnosis(report: dict[str, Any]) -> str:
-    """Sentences of result.json's `diagnosis`; their evidence unfolds."""
+    """What the data say against the model: one sentence each, its evidence unfolds."""
     items = []
     for found in report.get("diagnosis") or []:
-        if not isinstance(found, dict):
-            items.append(f"<li><bdi>{escape(str(found))}</bdi></li>")
-            continue
-        sentence = next((str(found[k]) for k in ("sentence", "text", "cause", "message") if found.get(k)), "")
-        rest = {k: v for k, v in found.items() if str(v) != sentence and v not in (None, "", [], {})}
-        facts = table(("what", "value"), rest.items()) if rest else ""
+        size = f" ({found['size_K']:.2f} K)" if _number(found.get("size_K")) else ""
+        sentence = f"{found.get('what', '')}{size}, {found.get('where', '')}: {found.get('done', '')}"
+        facts = "".join(f"<p><bdi>{escape(str(found[k]))}</bdi></p>" for k in ("evidence", "advice") if found.get(k))
         items.append(f"<li><details><summary><bdi>{escape(sentence)}</bdi></summary>{facts}</details></li>")
     return f"<ul>{''.join(items)}</ul>" if items else ""
 

@@ -44,6 +44,7 @@ FLAG_TEXT = {
     VertexFlag.HIGH_RESIDUAL: "views disagree",
     VertexFlag.MOVED: "moved",
     VertexFlag.NOT_SKIN: "not skin",
+    VertexFlag.NOT_SKIN: "not skin",
 }
 TITLES = {
     "absolute": "Skin temperature",
@@ -159,7 +160,7 @@ def _maps(reported: Reported) -> list[dict[str, Any]]:
         scalar("sigma", "Uncertainty, one sigma", "K", mesh.uncertainty_K, 3),
         scalar("angle", "Viewing angle", "°", mesh.view_angle_deg, 0),
         scalar("count", "Thermal views", "", mesh.observations.astype(np.float64), 0),
-        {**scalar("flag", "Flags", "", np.array([5.0]), 0, "rainbow"), "range": (0, 5)},
+        {**scalar("flag", "Flags", "", np.array([6.0]), 0, "rainbow"), "range": (0, 6)},
     ]
     if mesh.surface.color_rgb is not None:
         maps.append({"id": "color", "title": "Colour picture", "unit": "", "kind": "color", "digits": 0,

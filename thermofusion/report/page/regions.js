@@ -2,6 +2,7 @@
 
 import { along, cross, dot, resampled, sub, unit } from "./surface.js";
 
+const NOT_SKIN = 64; // of the flags: left out of means, as in Python
 const MIN_FACING = 0.2, MARGIN_M = 0.02, PROFILE_STEP_M = 2e-3;
 
 /** A region's signed distance at every vertex: negative inside, NaN where it cannot reach. */
@@ -118,7 +119,7 @@ export class Measurer {
   }
 
   #area(region) {
-    const patch = patchOf(region, this.skin, (i) => !Number.isNaN(this.T[i]));
+    const patch = patchOf(region, this.skin, (i) => !Number.isNaN(this.T[i]) && !(this.columns.flags[i] & NOT_SKIN));
     const size = { area_cm2: patch.area * 1e4, segments: patch.segments, n: 0, vertex: patch.vertex };
     if (!patch.vertex.length) return { value_degC: NaN, sigma_K: NaN, ...size };
     const { vertex, weight, inside, known } = patch, T = vertex.map((i) => this.T[i]);
