@@ -1,8 +1,8 @@
 """How the errors of vertices add up in a mean over many of them.
 
 A mean averages what errs from spot to spot, not what its vertices have in common. Noise averages over pixels on the
-skin, errors of normals over the window that smoothed them. Calibration, ε(0), T_refl and reference are carried by their
-signed effects on every vertex; a thermal image that lies askew errs along the gradient, so that it cancels round a
+skin, errors of normals over the window that smoothed them. Calibration, ε(0), T_refl, gain and reference are carried by
+their signed effects on every vertex; a thermal image that lies askew errs along the gradient, so that it cancels round a
 warm spot and adds up on a slope. All other parts count in full.
 """
 
@@ -19,7 +19,7 @@ from .patch import Patch
 
 PIXEL_PATCH = 2.25  # pixels whose noise is one: bilinear sampling leaves 4/9 of the variance, over so much more area
 AVERAGED = ("noise", "normals")  # parts that a mean over an area reduces
-CARRIED = ("calibration", "emissivity0", "reflected")  # parts that the shared errors hold, signed
+ALONG_GRADIENT = ("registration", "scale")  # parts that a picture displaced on the skin, or skin displaced, makes
 DERIVED = ("absolute",)  # made of the others
 MIN_COS = 0.2  # a pixel is not taken to cover more skin than at 78°
 
@@ -70,8 +70,8 @@ class VertexErrors:
     """The errors of every vertex, as means over vertices need them; unmeasured vertices hold 0.
 
     noise_K, normals_K, rest_K : (V,). noise_K_m : (V,) noise times the width of skin it is one over, K m. askew_K :
-    (V, 3) registration along the gradient. common_K : (V, R) signed effects of shared causes, level_K : (R,) their
-    level over the body. normal_window_m : over which errors of normals are one; inf where it is not known.
+    (V, 3) what a displacement does, along the gradient. common_K : (V, R) signed effects of shared causes, level_K :
+    (R,) their level over the body. normal_window_m : over which errors of normals are one; inf where it is not known.
     """
 
     noise_K: Float32
@@ -90,12 +90,14 @@ class VertexErrors:
         parts = {k: np.nan_to_num(v) for k, v in mesh.uncertainty_parts.items()}
         zero = np.zeros(len(mesh), np.float32)
         noise, normals = parts.get("noise", zero), parts.get("normals", zero)
-        apart = (*AVERAGED, "registration", *DERIVED, *(CARRIED if shared else ()))
+        carried = {name.split()[0] for name in shared.names} if shared else set()  # signed, in the shared errors
+        apart = {*AVERAGED, *ALONG_GRADIENT, *DERIVED, *carried}
         rest = np.sqrt(sum((v.astype(np.float64) ** 2 for k, v in parts.items() if k not in apart), zero))
         if not parts:
             rest = np.nan_to_num(mesh.uncertainty_K)
         direction = gradient_direction(body.vertices_m, body.triangles, mesh.temperature_degC)
-        askew = parts.get("registration", zero)[:, None] * direction
+        displaced = np.sqrt(sum((parts.get(k, zero).astype(np.float64) ** 2 for k in ALONG_GRADIENT), zero))
+        askew = displaced[:, None] * direction
         if shared is None:
             none = np.zeros((len(mesh), 0), np.float32)
             return cls(noise, noise * np.float32(1e6), normals, _32(rest), _32(askew), none, none[0], (), np.inf)
@@ -122,7 +124,7 @@ class VertexErrors:
         own = {
             "noise": float(np.sqrt(min(float(patch.mean(self.noise_K**2)), noise_K2))),
             "normals": float(np.sqrt(float(patch.mean(self.normals_K**2)) * min(1.0, normals_share))),
-            "registration": float(np.linalg.norm(patch.mean(self.askew_K))),
+            "displacement": float(np.linalg.norm(patch.mean(self.askew_K))),
             "other": float(patch.mean(self.rest_K)),
         }
         return MeanErrors(own, common - self.level_K, common, self.names)
