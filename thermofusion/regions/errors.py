@@ -2,8 +2,8 @@
 
 A mean averages what errs from spot to spot, not what its vertices have in common. Noise averages over pixels on the
 skin, errors of normals over the window that smoothed them. Calibration, ε(0), T_refl, gain and reference are carried by
-their signed effects on every vertex; a thermal image that lies askew errs along the gradient, so that it cancels round a
-warm spot and adds up on a slope. All other parts count in full.
+their signed effects on every vertex; a thermal image that lies askew errs along the gradient, so that it cancels round
+a warm spot and adds up on a slope. All other parts count in full.
 """
 
 from __future__ import annotations
