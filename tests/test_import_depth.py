@@ -274,6 +274,21 @@ def test_lost_lines_are_found_where_they_are(torso, lost):
     assert len(messages) == (2 if lost == [40, 120] else 1)
 
 
+def test_lost_depth_frames_are_no_lost_lines(torso):
+    """Poses without an image: nothing is moved, with or without a line that is lost besides."""
+    depth = torso.depth
+    kept = np.delete(np.arange(len(depth)), [30, 31, 77, 140])
+    parts = {k: getattr(depth, k)[kept] for k in ("times_s", "index", "usable")}
+    places = tuple(depth.places[i] for i in kept)
+    fewer = replace(torso, depth=replace(depth, **parts, places=places, load=lambda i: depth.load(int(kept[i]))))
+    got, messages = believed(fewer)
+    assert not messages
+    np.testing.assert_array_equal(got.T_world_depth, torso.trajectory.T_world_depth)
+    t, T = torso.trajectory.times_s, torso.trajectory.T_world_depth
+    got, messages = believed(replace(fewer, trajectory=Trajectory(t[:-1], np.delete(T, 100, axis=0))))
+    assert len(messages) == 1
+
+
 def test_poses_of_something_else_are_refused_by_name(torso):
     T = torso.trajectory.T_world_depth[np.random.default_rng(1).permutation(len(torso.trajectory))]
     with pytest.raises(QualityError, match="do not fit the depth"):
