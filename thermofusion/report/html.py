@@ -91,7 +91,7 @@ def report_html(reported: Reported, picture: UInt8 | None = None) -> str:
         "PICTURES": _picture(picture),
         "BELOW": cards.below(reported.report, temperature, reported.recipe.to_toml(), reported.hashes),
         "FOOT": f"thermofusion {escape(__version__)} · research use, not a diagnosis · scan "
-        f"<bdi>{escape(str(facts['scan']))}</bdi>",
+        f"<bdi>{escape(str(facts['scan']))}</bdi>, run {escape(str(reported.report.get('run', '')))}",
         "FACTS": _json(facts),
         "COLUMNS": columns.text(),
     }
