@@ -31,7 +31,7 @@ from thermofusion.types import SignalCurve
 # What is refused, and the words of its sentence: the cause, and the way.
 NAMED = {
     "flir-no-raw-image.jpg": "no raw image.*radiometric JPEG",
-    "flir-vue-pro.jpg": "does not measure temperatures.*blackbody",
+    "flir-vue-pro.jpg": "does not measure temperatures.*thermal curve",
     "dji-h20t.jpg": "DJI R-JPEG.*Thermal SDK",
     "hikmicro-pocket.jpeg": "HIKMICRO.*Analyzer as CSV",
     "uni-t-uti260b.bmp": "UNI-T.*CSV or float TIFF",

@@ -17,8 +17,8 @@ from thermofusion.pipeline import STAGES, fuse
 from thermofusion.recipe import Recipe, load_recipe
 from thermofusion.scans import open_scan
 
-BASE = ["surface.voxel_mm=10", "tracking.fragment_frames=3", "output.views=false", "output.report=false", "output.formats=[]"]
-BASE += ["temperature.crosscal.max_vertices=1000"]
+BASE = ["surface.voxel_mm=10", "tracking.fragment_frames=3", "output.views=false", "output.formats=[]"]
+BASE += ["output.report=false", "temperature.crosscal.max_vertices=1000"]
 SPECIAL = {  # where a value has to fit others
     "mapping.last_resort_angle_deg": 80.0,
     "mapping.max_angle_deg": 50.0,
