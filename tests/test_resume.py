@@ -18,7 +18,7 @@ from thermofusion.recipe import Recipe, load_recipe
 from thermofusion.scans import open_scan
 
 BASE = ["surface.voxel_mm=10", "tracking.fragment_frames=3", "output.views=false", "output.formats=[]"]
-BASE += ["output.report=false", "temperature.crosscal.max_vertices=1000"]
+BASE += ["output.report=false", "temperature.crosscal.max_vertices=1000", "temperature.crosscal.vignetting=false"]
 SPECIAL = {  # where a value has to fit others
     "mapping.last_resort_angle_deg": 80.0,
     "mapping.max_angle_deg": 50.0,
