@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..errors import RecipeError, ScanError
-from .bundles import bundled
 from .console import emit, note, progress
+from .options import Json, spelled_out
 
 if TYPE_CHECKING:
     from ..scans.thermal import ThermalFrames, ThermalSaid
     from ..types import Scan, SignalCurve
 
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Force = Annotated[bool, typer.Option("--overwrite", help="Replace an existing scan folder.")]
 
 
@@ -55,7 +54,7 @@ class ThermalOptions:
 
 def register(app: typer.Typer) -> None:
     """Add this module's verbs."""
-    app.command("import")(bundled(import_))
+    app.command("import")(spelled_out(import_))
     app.command()(simulate)
 
 
