@@ -184,6 +184,9 @@ def as_thermal(stream: Stream, camera: ThermalCamera) -> ThermalStream:
 # ---------------------------------------------------------------- poses
 
 
+NO_TIMES = f"the recording carries no times: {ASSUMED_RATE_HZ:.0f} frames a second by number are assumed"
+
+
 def frame_times(numbers: Sequence[int]) -> Float:
     """Times (N,) in s of frames that carry only numbers, at the assumed rate."""
     return np.asarray(numbers, np.float64) / ASSUMED_RATE_HZ

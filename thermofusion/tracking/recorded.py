@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..depth.filter import read_ahead
-from ..errors import QualityError
+from ..errors import QualityError, counted
 from ..files.tum import poses_of, rows_of
 from ..geometry.rigid import interpolate_trajectory, invert, rotation_angle_deg, transform_points
 from ..types import Camera, Float, Float32, Scan, Trajectory
@@ -136,7 +136,7 @@ def _lost_lines(scan: Scan, trajectory: Trajectory, pairs: _Pairs, misfit: Float
         at, shift = found
         trajectory = _shifted(scan, trajectory, at, shift)
         misfit = pairs.misfit_mm(trajectory)
-        lines = f"{abs(shift)} line{'s' * (abs(shift) > 1)} of the recorded poses"
+        lines = f"{counted(abs(shift), 'line')} of the recorded poses"
         what = "missing" if shift > 0 else "too many"
         messages.append(f"{lines} {what} at depth frame {int(scan.depth.index[at])}: later poses moved to their frames")
     bad = np.flatnonzero(misfit > BAD_MM)

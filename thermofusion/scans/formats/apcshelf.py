@@ -16,7 +16,7 @@ from ...errors import ScanError
 from ...files.reading import decode_image, text_lines
 from ...files.tum import poses_to_trajectory
 from ...types import Float, Scan
-from ..common import ImageFiles, frame_times, image_size, image_stream, make_camera, make_rig
+from ..common import NO_TIMES, ImageFiles, frame_times, image_size, image_stream, make_camera, make_rig
 from ..naming import in_order, real_files
 from ..stated import NOTHING, Stated
 
@@ -67,7 +67,7 @@ def read_shelf(path: Path, *, registered: bool, unit_m: float = UNIT_M) -> Scan:
         depth_unit_m=unit_m,
         times_assumed=True,
         notes=(
-            "the recording carries no times: 30 frames a second by number are assumed",
+            NO_TIMES,
             *([NOT_MOVED] if registered else []),
         ),
     )

@@ -15,7 +15,7 @@ from ...files.reading import read_json
 from ...files.tum import poses_to_trajectory
 from ...geometry.rigid import invert, pose
 from ...types import Scan, Trajectory
-from ..common import make_camera, make_rig
+from ..common import make_camera
 from ..naming import Named, images_in, in_order
 from ..stated import NOTHING, Stated
 from . import images
@@ -46,19 +46,7 @@ def read(path: Path, stated: Stated = NOTHING) -> Scan:
     layout = images.depth_layout(samples, stated, scales.pop() * 1e-3)
     height, width = samples[0].shape[:2]
     camera = stated.camera("depth") or make_camera(width, height, K[0], place=file)
-    color_camera, notes = images.color_camera(color, camera, stated) if color.files else (None, ())
-    return Scan(
-        name=path.resolve().name,
-        root=path,
-        format="bop",
-        rig=make_rig(camera, color_camera, place=path),
-        depth=images.depth_stream(depth, camera, layout),
-        color=None if color_camera is None else images.color_stream(color, color_camera),
-        trajectory=_poses(rows, depth, file),
-        depth_unit_m=layout.stored_unit_m,
-        notes=("the recording carries no times: 30 frames a second by number are assumed", *notes),
-        times_assumed=True,
-    )
+    return images.Folder(path, "bop", stated, depth, color).scan(camera, layout, trajectory=_poses(rows, depth, file))
 
 
 def _poses(rows: list[Any], depth: Named, file: Path) -> Trajectory | None:

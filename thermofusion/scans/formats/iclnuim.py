@@ -16,7 +16,7 @@ from ...errors import ScanError
 from ...files.reading import read_text
 from ...files.tum import poses_to_trajectory
 from ...types import Camera, Float, Scan
-from ..common import make_camera, make_rig, make_stream
+from ..common import NO_TIMES, make_camera, make_rig, make_stream
 from ..naming import in_order, real_files
 from ..stated import NOTHING, Stated
 from . import images
@@ -57,7 +57,7 @@ def read(path: Path, stated: Stated = NOTHING) -> Scan:
         color=None if color_camera is None else images.color_stream(color, color_camera),
         trajectory=poses_to_trajectory(depth.stamps, poses, place=path),
         depth_unit_m=images.FLOAT_UNIT_M,
-        notes=("the recording carries no times: 30 frames a second by number are assumed", *notes),
+        notes=(NO_TIMES, *notes),
         times_assumed=True,
     )
 

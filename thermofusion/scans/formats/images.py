@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from ...errors import ScanError
 from ...files.reading import MAX_PIXELS, claimed_size, decode_image, read_bytes
-from ...types import Camera, Float, Float32, Stream
-from ..common import ImageFiles, image_stream, make_camera, make_stream
+from ...types import Camera, Float, Float32, Scan, Stream, Trajectory
+from ..common import NO_TIMES, ImageFiles, image_stream, make_camera, make_rig, make_stream
 from ..naming import Named
 from ..stated import Stated
 
@@ -196,6 +196,40 @@ def color_camera(
         return resized(depth, size, named.files[0]), ()
     text = f"colour ({size[0]} x {size[1]} px) is left out: its camera is not known; a rig.json with cameras.color"
     return None, (f"{text} and extrinsics.T_color_depth brings it in",)
+
+
+@dataclass(frozen=True, eq=False)
+class Folder:
+    """Depth and colour images of a recording, and what was said of it.
+
+    format : the reader's name. size : (width, height) px of depth files without a header.
+    """
+
+    path: Path
+    format: str
+    stated: Stated
+    depth: Named
+    color: Named
+    size: tuple[int, int] | None = None
+
+    def scan(
+        self, camera: Camera, layout: DepthLayout, *, trajectory: Trajectory | None = None, notes: Sequence[str] = ()
+    ) -> Scan:
+        """All of it as a scan, its colour where that camera is known. camera : depth's. Raises ScanError."""
+        seen, more = color_camera(self.color, camera, self.stated) if self.color.files else (None, ())
+        untimed = self.depth.times_s is None
+        return Scan(
+            name=self.path.resolve().name,
+            root=self.path,
+            format=self.format,
+            rig=make_rig(camera, seen, place=self.path),
+            depth=depth_stream(self.depth, camera, layout, self.size),
+            color=None if seen is None else color_stream(self.color, seen),
+            trajectory=trajectory,
+            depth_unit_m=layout.stored_unit_m,
+            notes=(*([NO_TIMES] if untimed else []), *layout.notes, *notes, *more),
+            times_assumed=untimed,
+        )
 
 
 def resized(camera: Camera, size: tuple[int, int], place: object) -> Camera:

@@ -19,7 +19,7 @@ from ...errors import ScanError
 from ...files.reading import is_named, read_json, read_numbers, text_lines
 from ...files.tum import poses_to_trajectory
 from ...types import Camera, Scan, Trajectory
-from ..common import NOMINAL_K, make_camera, make_rig
+from ..common import NOMINAL_K, make_camera
 from ..naming import Named, images_in, in_order
 from ..stated import NOTHING, Stated
 from . import images
@@ -50,30 +50,13 @@ def read(path: Path, stated: Stated = NOTHING) -> Scan:
     sun3d = depth.times_s is not None or (given.file is not None and given.file.name in TEXT_NAMES)
     layout = images.depth_layout(samples, stated, given.unit_m, rotates=sun3d)
     camera, notes = _camera(path, given, samples[0].shape, stated)
-    notes += layout.notes
     color = in_order(_images(path, COLOR_NAMES, images.COLOR_SUFFIXES))
     if color.files and (color.times_s is None) != (depth.times_s is None):
         raise ScanError("only one of colour and depth carries time stamps in its names", place=path)
-    if depth.times_s is None:
-        notes += ("the recording carries no times: 30 frames a second by number are assumed",)
-    color_camera = None
-    if color.files:
-        color_camera, more = images.color_camera(color, camera, stated)
-        notes += more
     log = next((path / n for n in LOG_NAMES if is_named(path / n)), None)
     trajectory, more = (None, ()) if log is None else _trajectory(log, depth)
-    return Scan(
-        name=path.resolve().name,
-        root=path,
-        format="redwood",
-        rig=make_rig(camera, color_camera, place=path),
-        depth=images.depth_stream(depth, camera, layout, stated.depth_size()),
-        color=None if color_camera is None else images.color_stream(color, color_camera),
-        trajectory=trajectory,
-        depth_unit_m=layout.stored_unit_m,
-        notes=(*notes, *more, *_unread(path, log)),
-        times_assumed=depth.times_s is None,
-    )
+    folder = images.Folder(path, "redwood", stated, depth, color, stated.depth_size())
+    return folder.scan(camera, layout, trajectory=trajectory, notes=(*notes, *more, *_unread(path, log)))
 
 
 def _images(path: Path, names: tuple[str, ...], suffixes: tuple[str, ...]) -> list[Path]:

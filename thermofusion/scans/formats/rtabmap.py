@@ -11,7 +11,6 @@ import sqlite3
 import struct
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,7 +19,7 @@ from ...files.reading import decode_image, open_regular, read_numbers, read_text
 from ...files.tum import poses_of, poses_to_trajectory
 from ...geometry.rigid import pose
 from ...types import Camera, Float, Scan, Trajectory
-from ..common import make_camera, make_rig, make_stream
+from ..common import as_loaded, make_camera, make_rig, make_stream
 from ..naming import images_in, in_order
 from ..stated import NOTHING, Stated
 from . import images
@@ -73,7 +72,7 @@ def _read_database(path: Path, stated: Stated) -> Scan:
 
     def picture(i: int) -> NDArray:
         image = decode_image(blob("image", i), shape=camera.shape, kind="color", place=places[i])
-        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB if image.ndim == 3 else cv2.COLOR_GRAY2RGB))
+        return as_loaded("color", image, places[i], 1.0)
 
     colored = _query(path, "SELECT count(*) FROM Data WHERE depth IS NOT NULL AND image IS NULL")[0][0] == 0
     return Scan(
@@ -150,19 +149,8 @@ def _read_export(path: Path, stated: Stated) -> Scan:
     own, T_body_camera = _yaml(calibrations.files[0])
     camera = stated.camera("depth") or own
     layout = images.depth_layout(images.sample_depth(depth, None), stated, None)
-    color_camera, notes = images.color_camera(color, camera, stated) if color.files else (None, ())
-    return Scan(
-        name=path.resolve().name,
-        root=path,
-        format="rtabmap",
-        rig=make_rig(camera, color_camera, place=path),
-        depth=images.depth_stream(depth, camera, layout),
-        color=None if color_camera is None else images.color_stream(color, color_camera),
-        trajectory=_export_poses(path, name or "", T_body_camera),
-        depth_unit_m=layout.stored_unit_m,
-        notes=(*layout.notes, *notes),
-        times_assumed=depth.times_s is None,
-    )
+    trajectory = _export_poses(path, name or "", T_body_camera)
+    return images.Folder(path, "rtabmap", stated, depth, color).scan(camera, layout, trajectory=trajectory)
 
 
 def _yaml(file: Path) -> tuple[Camera, Float]:

@@ -15,7 +15,7 @@ from ...files.reading import is_named, read_numbers
 from ...files.tum import poses_to_trajectory
 from ...geometry.rigid import pose
 from ...types import Scan, Trajectory
-from ..common import ImageFiles, frame_times, image_size, image_stream, make_camera, make_rig
+from ..common import NO_TIMES, ImageFiles, frame_times, image_size, image_stream, make_camera, make_rig
 from ..naming import Named, in_order, real_files
 from ..stated import NOTHING, Stated
 
@@ -42,7 +42,7 @@ def read(path: Path, stated: Stated = NOTHING) -> Scan:
     K = read_numbers(own, columns=3) if is_named(own) else PUBLISHED_K
     camera = stated.camera("depth") or make_camera(width, height, K, place=own if is_named(own) else path)
     unit_m = stated.unit_m(0.001)
-    notes = ["the recording carries no times: 30 frames a second by number are assumed"]
+    notes = [NO_TIMES]
     color_camera, color = None, None
     color_frames = _frames(path, "color")
     if color_frames.files:

@@ -20,7 +20,7 @@ from ...common import ImageFiles, image_stream, make_camera, make_rig, make_stre
 from ...naming import images_in
 from ...stated import NOTHING, Stated
 from ..images import DepthLayout, resized
-from . import from_opengl, trusted
+from . import from_opengl, trusted_image
 
 
 def recognise(path: Path) -> bool:
@@ -46,11 +46,7 @@ def read(path: Path, stated: Stated = NOTHING) -> Scan:
     T = from_opengl(np.stack([_pose(t, cameras / f"{s}.json") for t, s in zip(trees, stamps, strict=True)]))
 
     def load(i: int) -> NDArray:
-        file = files[stamps[i]]
-        sure = root / "confidence" / file.name
-        confidence = read_image(sure, kind="confidence") if sure.is_file() else None
-        raw = read_image(file, shape=camera.shape, kind="depth")
-        return layout.metres(trusted(raw, confidence), file)
+        return trusted_image(files[stamps[i]], root / "confidence", camera, layout)
 
     seen = [i for i, s in enumerate(stamps) if (pictures / f"{s}.jpg").is_file()]
     shots = ImageFiles("color", [pictures / f"{stamps[i]}.jpg" for i in seen], times[seen], pictures, seen)

@@ -11,16 +11,14 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from ....errors import ScanError
 from ....files.reading import COPY_AGAIN, MAX_FILE_BYTES, decode_image, parse_json
-from ....files.tum import poses_to_trajectory
+from ....files.tum import poses_of, poses_to_trajectory
 from ....types import Scan
-from ...common import make_camera, make_rig, make_stream
+from ...common import as_loaded, make_camera, make_rig, make_stream
 from ...stated import NOTHING, Stated
 from ..images import FLOAT_UNIT_M, DepthLayout, resized
 from . import from_opengl, trusted
@@ -44,8 +42,7 @@ def read(path: Path, stated: Stated = NOTHING) -> Scan:
         raise ScanError("'metadata' lacks w, h, dw, dh, K or poses", place=path) from None
     n, layout = len(times), DepthLayout(stated.unit_m(1.0))
     camera = stated.camera("depth") or resized(color, size, path)
-    T = np.tile(np.eye(4), (len(rows), 1, 1))
-    T[:, :3, :3], T[:, :3, 3] = Rotation.from_quat(rows[:, :4]).as_matrix(), rows[:, 4:]
+    T = poses_of(np.roll(rows, 3, axis=1))  # the position first
     places = [f"{path}, frame {i}" for i in range(n)]
 
     def depth(i: int) -> NDArray:
@@ -56,7 +53,7 @@ def read(path: Path, stated: Stated = NOTHING) -> Scan:
 
     def picture(i: int) -> NDArray:
         image = decode_image(_member(path, f"rgbd/{i}.jpg"), shape=color.shape, kind="color", place=places[i])
-        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+        return as_loaded("color", image, places[i], 1.0)
 
     return Scan(
         name=path.stem,

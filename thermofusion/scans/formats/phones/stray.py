@@ -21,7 +21,7 @@ from ...common import make_camera, make_rig, make_stream
 from ...naming import images_in, in_order
 from ...stated import NOTHING, Stated
 from ..images import DepthLayout, resized
-from . import trusted
+from . import trusted_image
 
 
 def recognise(path: Path) -> bool:
@@ -46,10 +46,7 @@ def read(path: Path, stated: Stated = NOTHING) -> Scan:
     layout = DepthLayout(stated.unit_m(0.001))
 
     def load(i: int) -> NDArray:
-        raw = read_image(depth.files[i], shape=camera.shape, kind="depth")
-        sure = path / "confidence" / depth.files[i].name
-        confidence = read_image(sure, kind="confidence") if sure.is_file() else None
-        return layout.metres(trusted(raw, confidence), depth.files[i])
+        return trusted_image(depth.files[i], path / "confidence", camera, layout)
 
     places = [str(f) for f in depth.files]
     return Scan(

@@ -13,7 +13,7 @@ import numpy as np
 
 from ....files.reading import read_text
 from ....types import Camera, Scan
-from ...common import make_camera, make_rig
+from ...common import make_camera
 from ...naming import images_in, in_order
 from ...stated import NOTHING, Stated, unmirrored
 from .. import images
@@ -34,24 +34,10 @@ def read(path: Path, stated: Stated = NOTHING) -> Scan:
     depth = in_order(images_in(path / "depth", (".bin",)))
     samples = images.sample_depth(depth, SIZE)
     layout = images.depth_layout(samples, stated, None)
-    own, found = _camera(path)
-    notes = list(found)
+    own, notes = _camera(path)
     camera = stated.camera("depth") or own
     color = in_order(next((f for n in COLOR_NAMES if (f := images_in(path / n, images.COLOR_SUFFIXES))), []))
-    color_camera, more = images.color_camera(color, camera, stated) if color.files else (None, ())
-    if depth.times_s is None:
-        notes.append("the recording carries no times: 30 frames a second by number are assumed")
-    scan = Scan(
-        name=path.resolve().name,
-        root=path,
-        format="kinect2",
-        rig=make_rig(camera, color_camera, place=path),
-        depth=images.depth_stream(depth, camera, layout, SIZE),
-        color=None if color_camera is None else images.color_stream(color, color_camera),
-        depth_unit_m=layout.stored_unit_m,
-        notes=(*notes, *more, *layout.notes),
-        times_assumed=depth.times_s is None,
-    )
+    scan = images.Folder(path, "kinect2", stated, depth, color, SIZE).scan(camera, layout, notes=notes)
     return scan if stated.mirrored else unmirrored(scan)
 
 

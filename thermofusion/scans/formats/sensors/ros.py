@@ -22,7 +22,7 @@ from ....errors import ScanError
 from ....files.reading import COPY_AGAIN, decode_image, open_regular
 from ....geometry.rigid import invert, pose
 from ....types import Camera, Float, Scan, Stream, ThermalCamera
-from ...common import Kind, as_thermal, make_camera, make_rig, make_stream
+from ...common import Kind, as_loaded, as_thermal, make_camera, make_rig, make_stream
 from ...stated import NOTHING, Stated
 from ..images import FLOAT_UNIT_M, DepthLayout
 
@@ -193,7 +193,7 @@ def _loader(reader: Any, topic: _Topic, path: Path) -> Callable[[int], NDArray]:
 def _image(message: Any, place: object) -> NDArray:
     data = bytes(message.data)
     if not hasattr(message, "encoding"):
-        return cv2.cvtColor(decode_image(data, shape=None, kind="color", place=place), cv2.COLOR_BGR2RGB)
+        return as_loaded("color", decode_image(data, shape=None, kind="color", place=place), place, 1.0)
     h, w, step = message.height, message.width, message.step
     kind = DEPTH_ENCODINGS.get(message.encoding, "u1")
     channels = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4}.get(message.encoding, 1)

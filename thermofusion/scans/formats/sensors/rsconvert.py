@@ -11,7 +11,6 @@ from pathlib import Path
 
 from ....errors import ScanError
 from ....types import Scan
-from ...common import make_rig
 from ...naming import Named, in_order, real_files
 from ...stated import NOTHING, Stated
 from .. import images
@@ -31,20 +30,9 @@ def read(path: Path, stated: Stated = NOTHING) -> Scan:
     camera = stated.camera("depth")
     if camera is None:
         raise ScanError("rs-convert writes no camera", place=path, hint="put a rig.json with cameras.depth beside it")
-    samples = images.sample_depth(depth, stated.depth_size())
-    layout = images.depth_layout(samples, stated, None)
-    color_camera, notes = images.color_camera(color, camera, stated) if color.files else (None, ())
-    return Scan(
-        name=path.resolve().name,
-        root=path,
-        format="rs-convert",
-        rig=make_rig(camera, color_camera, place=path),
-        depth=images.depth_stream(depth, camera, layout, stated.depth_size()),
-        color=None if color_camera is None else images.color_stream(color, color_camera),
-        depth_unit_m=layout.stored_unit_m,
-        notes=(*layout.notes, *notes),
-        times_assumed=depth.times_s is None,
-    )
+    size = stated.depth_size()
+    layout = images.depth_layout(images.sample_depth(depth, size), stated, None)
+    return images.Folder(path, "rs-convert", stated, depth, color, size).scan(camera, layout)
 
 
 def _named(path: Path, pattern: re.Pattern[str]) -> Named:

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +20,7 @@ from ....files.reading import COPY_AGAIN, MAX_PIXELS, decode_image, open_regular
 from ....files.tum import poses_to_trajectory
 from ....geometry.rigid import invert
 from ....types import Float, Scan
-from ...common import make_camera, make_rig, make_stream
+from ...common import as_loaded, make_camera, make_rig, make_stream
 from ...stated import NOTHING, Stated
 from ..images import DepthLayout
 
@@ -82,7 +81,7 @@ def read(path: Path, stated: Stated = NOTHING) -> Scan:
 
     def picture(i: int) -> NDArray:
         image = decode_image(_part(path, frames[i].color), shape=(ch, cw), kind="color", place=places[i])
-        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+        return as_loaded("color", image, places[i], 1.0)
 
     times = np.array([f.time_s for f in frames])
     tracked = [i for i, f in enumerate(frames) if np.isfinite(f.pose).all()]
