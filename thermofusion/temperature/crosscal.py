@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.stats import chi2 as chi2_distribution
-from scipy.stats import t as student
+from scipy.special import chdtri, stdtrit
 
 from ..errors import ScanError
 from ..physics.emissivity import AngleTable, EmissivityModel, reshaped, shape_direction
@@ -415,9 +414,9 @@ def _level_variance(system: OverlapSystem, solution: Solution) -> float:
     scatter badly, which Student's t pays for. It shifts all: (W m-2 sr-1)².
     """
     chi2, freedom, weight = _readings_scatter(system, solution)
-    if not freedom or chi2 < chi2_distribution.isf(READINGS_ALIKE, freedom):
+    if not freedom or chi2 < chdtri(freedom, READINGS_ALIKE):
         return solution.level_variance
-    wide = (student.isf(0.025, freedom) / NORMAL_95) ** 2 * chi2 / freedom
+    wide = (stdtrit(freedom, 0.975) / NORMAL_95) ** 2 * chi2 / freedom
     return solution.level_variance + (wide - 1) / weight
 
 
@@ -459,7 +458,7 @@ def _told(r: Refinement, system: OverlapSystem, solution: Solution) -> dict[str,
     references_K : scatter of references' readings where it is no chance."""
     chi2, freedom, weight = _readings_scatter(system, solution)
     scatter = 0.0
-    if freedom and chi2 > chi2_distribution.isf(READINGS_ALIKE, freedom):
+    if freedom and chi2 > chdtri(freedom, READINGS_ALIKE):
         scatter = float(np.sqrt(chi2 / freedom * (freedom + 1) / weight)) / system.slope_L
     return {
         "before": {k: [a.size_K, a.z] for k, a in r.before.items()},
