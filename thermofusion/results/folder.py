@@ -124,7 +124,8 @@ def write_result(
         if result.temperature is not None:
             mesh = result.mesh
             export(mesh, new, tuple(output.formats), palette=output.palette, range_degC=output.range_degC)
-            save_artifact(new / "result.npz", replace(result.temperature, mesh=mesh))
+            shown = replace(result.temperature, mesh=mesh)
+            save_artifact(new / "result.npz", shown)
             if output.views:
                 cast = None if casts is None else casts.result()
                 range_degC = output.range_degC
@@ -132,7 +133,6 @@ def write_result(
                     result.mesh_in_world, new / VIEWS, palette=output.palette, range_degC=range_degC, casts=cast
                 )
             if output.report:
-                shown = replace(result.temperature, mesh=mesh)
                 reported = Reported(shown, result.report, recipe, result.mapped, hashes=hashes_of(new))
                 overview = new / VIEWS / "overview.png"
                 write_report(new / PAGE, reported, read_image(overview)[..., ::-1] if overview.is_file() else None)

@@ -95,10 +95,9 @@ def solve(
     """
     problem = ThermalProblem.of(scan, mesh, normal_window_m, mapped, mapping, temperature)
     progress("temperature", 1, 4)
-    calibration, notes, other = calibrated(problem)
+    calibration, notes, other, first = calibrated(problem)
     problem = problem.without(other) if other.any() else problem
     progress("temperature", 2, 4)
-    first = blend(problem, calibration, with_uncertainty=False)
     problem = problem.informed(mesh, first.absolute_K)
     progress("temperature", 3, 4)
     result = blend(problem, calibration)
@@ -126,23 +125,27 @@ def _shared(result: BlendResult, focal_px: float, normal_window_m: float) -> Sha
     return SharedErrors.of(effects, focal_px, normal_window_m)
 
 
-def calibrated(problem: ThermalProblem) -> tuple[Calibration | None, tuple[str, ...], Bool]:
-    """The cross-calibration and its messages, or None and why there is none; and which vertices (V,) are not skin.
+def calibrated(problem: ThermalProblem) -> tuple[Calibration | None, tuple[str, ...], Bool, BlendResult]:
+    """The cross-calibration and its messages, or None and why there is none; which vertices (V,) are not skin; a first
+    map, without uncertainty.
 
     What is not skin takes no part in the calibration.
     """
-    none = np.zeros(len(problem), bool)
-    if problem.settings.method != "joint":
-        return None, (), none
-    if problem.n_views < 2:
-        return None, ("one thermal view cannot be cross-calibrated: the camera's offset stays in the result",), none
+    if problem.settings.method != "joint" or problem.n_views < 2:
+        alone = "one thermal view cannot be cross-calibrated: the camera's offset stays in the result"
+        first = blend(problem, None, with_uncertainty=False)
+        return None, (alone,) if problem.settings.method == "joint" else (), np.zeros(len(problem), bool), first
     overlap = Overlap.of(problem)
     plain = overlap.plain()
-    other = not_skin(problem, plain, blend(problem, plain, with_uncertainty=False))
+    first = blend(problem, plain, with_uncertainty=False)
+    other = not_skin(problem, plain, first)
     if other.any():
-        overlap = Overlap.of(problem.without(other))
+        problem = problem.without(other)
+        overlap = Overlap.of(problem)
     calibration = overlap.refined()
-    return calibration, calibration.messages, other
+    if other.any() or calibration.sensor is not None:  # else the plain one says the same
+        first = blend(problem, calibration, with_uncertainty=False)
+    return calibration, calibration.messages, other, first
 
 
 def unmeasured(surface: SurfaceMesh, temperature: TemperatureSection) -> Temperature:
