@@ -22,6 +22,7 @@ from ..files.tum import MAX_POSITION_M
 from ..geometry.mesh import vertex_areas
 from ..geometry.rays import RayScene
 from ..robust import NORMAL_95, weighted_quantile
+from ..temperature.references import CONTACT_FAR_M, under_sensor
 from ..types import Float, Float32, ThermalMesh
 from .contacts import SkinReading, read_contacts
 from .register import Registration, as_they_are, mirrored, register
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
 TRUTH_ARRAYS = ("vertices_m", "triangles", "temperature_degC")
 MAX_DISTANCE_M = 0.010  # between partners on the two surfaces
 FACING = 0.5  # cosine between normals of partners
-CONTACT_RADIUS_M, CONTACT_FAR_M = 0.006, 0.03  # skin under a contact sensor; farther off is another place
 LOADING_NOTE = (
     "a contact sensor changes what it measures: its lead conducts heat and it covers skin that would radiate and "
     "evaporate. A bias common to all sensors may be theirs; the spread about it is what tests the map"
@@ -254,16 +254,16 @@ def compare_contacts(mesh: ThermalMesh, readings: tuple[SkinReading, ...]) -> Co
     """The map under each contact sensor against its reading. Raises ScanError for a sensor off the surface."""
     map_degC, sigma_K = np.empty(len(readings)), np.empty(len(readings))
     for i, reading in enumerate(readings):
-        d = np.linalg.norm(mesh.surface.vertices_m - reading.p_world_m.astype(np.float32), axis=1)
-        if d.min() > CONTACT_FAR_M:
+        under, off_m = under_sensor(mesh.surface, reading.p_world_m)
+        if off_m > CONTACT_FAR_M:
             raise ScanError(
-                f"the contact reading '{reading.name}' is {d.min() * 100:.0f} cm off the surface",
+                f"the contact reading '{reading.name}' is {off_m * 100:.0f} cm off the surface",
                 hint="its point is in metres, in the mesh's frame; of the recording's world: see --frame",
             )
-        under = (d <= max(CONTACT_RADIUS_M, float(d.min()))) & mesh.measured
-        map_degC[i] = np.mean(mesh.temperature_degC[under]) if under.any() else np.nan
+        under = under[mesh.measured[under]]
+        map_degC[i] = np.mean(mesh.temperature_degC[under]) if len(under) else np.nan
         # errors of neighbouring vertices are not independent: their sigma is not divided by their number
-        sigma_K[i] = np.hypot(np.mean(mesh.uncertainty_K[under]), reading.uncertainty_K) if under.any() else np.nan
+        sigma_K[i] = np.hypot(np.mean(mesh.uncertainty_K[under]), reading.uncertainty_K) if len(under) else np.nan
     contact_degC = np.array([r.degC for r in readings])
     good = np.isfinite(map_degC)
     agreement = Agreement.of(map_degC[good], contact_degC[good], sigma_K=sigma_K[good])

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from ..export import palettes
 from ..export.axes import axes_of
 from ..files.json import plain
+from ..files.png import encode_png
 from ..files.whole import write_text
 from ..mapping.observe import Mapped
 from ..physics.band import ZERO_DEGC_K, Band
@@ -206,8 +207,7 @@ def _picture(picture: UInt8 | None) -> str:
         size = round(w * PICTURE_PX / h), PICTURE_PX
         picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
     h, w = picture.shape[:2]
-    data = cv2.imencode(".png", picture[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes()
-    source = base64.b64encode(data).decode("ascii")
+    source = base64.b64encode(encode_png(picture, small=True)).decode("ascii")
     return (
         f'<figure><img src="data:image/png;base64,{source}" width="{w}" height="{h}" alt="The body from the front, the '
         'back, its left and its right side, with the colour bar"><figcaption class="quiet">Seen from the front, the '

@@ -7,8 +7,6 @@ is known of the level, how the values spread, what lies outside the colours, and
 
 from __future__ import annotations
 
-import struct
-import zlib
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -24,6 +22,7 @@ from ..errors import ResourceError
 from ..export import palettes
 from ..export.axes import axes_of, axes_rotation
 from ..export.palettes import Beyond, beyond_range, percent
+from ..files.png import encode_png
 from ..files.whole import write_whole
 from ..types import Float, Float32, SurfaceMesh, ThermalMesh, UInt8
 from . import lettering
@@ -32,7 +31,6 @@ from .lettering import ALERT, INK, LEFT_TO_RIGHT, QUIET, Scale
 
 HEIGHT_PX = 900  # of a page; all sizes on it follow
 SHADING = 0.12  # of pages of a result: seen at 45°, a colour loses 4 % of its light; at the very edge 12 %
-PNG_HEAD = 33  # bytes of the signature and IHDR, behind which texts may stand
 SHAPE_SHADING = 0.75  # of geometry alone, where no colour is to be read
 SHAPE_RGB = (222, 220, 214)  # of a surface without colour
 RESIDUAL_RANGE = (0.0, 3.0)  # sigmas: beyond 3 a vertex is flagged HIGH_RESIDUAL
@@ -107,7 +105,7 @@ def write_views(
 def write_png(path: str | Path, image: UInt8, texts: Mapping[str, str] = MappingProxyType({})) -> Path:
     """Write an RGB (H, W, 3) or grey (H, W) picture, whole or not at all, its folder made. Raises ResourceError.
 
-    texts : by keyword, kept in the file (PNG's iTXt chunks, ISO/IEC 15948, 11.3.4).
+    texts : by keyword, kept in the file.
     """
     path = Path(path)
     if image.dtype != np.uint8 or image.shape[2:] not in ((), (3,)) or image.size == 0:
@@ -116,14 +114,7 @@ def write_png(path: str | Path, image: UInt8, texts: Mapping[str, str] = Mapping
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as e:
         raise ResourceError(f"the folder cannot be made ({e.strerror})", place=path.parent) from None
-    _, data = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)
-    png = data.tobytes()
-    return write_whole(path, [png[:PNG_HEAD], *(_text_chunk(k, v) for k, v in texts.items()), png[PNG_HEAD:]])
-
-
-def _text_chunk(keyword: str, text: str) -> bytes:
-    body = b"iTXt" + keyword.encode("latin-1") + bytes(5) + text.encode()  # not compressed, of no language
-    return struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
+    return write_whole(path, [encode_png(image, texts)])
 
 
 # ---------------------------------------------------------------- drawing

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from html import escape
 from typing import Literal
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..export import palettes
+from ..files.png import encode_png
 from ..types import Float, UInt8
 
 BLUE, ORANGE, GREEN, PURPLE, SKY, AMBER, INK, GREY = (
@@ -480,8 +480,7 @@ class _Legend:
 
 
 def _embed(rgb: UInt8, x: float, y: float, w: float, h: float) -> str:
-    _, data = cv2.imencode(".png", np.ascontiguousarray(rgb[..., ::-1]))
-    text = base64.b64encode(data.tobytes()).decode()
+    text = base64.b64encode(encode_png(rgb)).decode()
     return f'<image x="{x:.2f}" y="{y:.2f}" width="{w:.2f}" height="{h:.2f}" href="data:image/png;base64,{text}"/>'
 
 

@@ -11,7 +11,7 @@ from ..errors import ScanError
 from ..mapping.references import BlackbodyReading
 from ..physics.band import ZERO_DEGC_K, Band
 from ..physics.equation import apparent_radiance
-from ..types import BlackbodyReference, ContactReference, Int, Reference, SurfaceMesh
+from ..types import BlackbodyReference, ContactReference, Float, Int, Reference, SurfaceMesh
 
 CONTACT_RADIUS_M = 0.006  # vertices this near to a contact thermometer's spot are under its tip
 CONTACT_FAR_M = 0.03  # a spot farther off the surface is a mistake
@@ -52,6 +52,12 @@ def expected_readings(
     return tuple(out)
 
 
+def under_sensor(surface: SurfaceMesh, p_m: Float) -> tuple[Int, float]:
+    """Indices (K,) of the vertices under the tip of a contact sensor at p_m (3,), m, and its distance from them, m."""
+    d = np.linalg.norm(surface.vertices_m - p_m.astype(np.float32), axis=1)
+    return np.flatnonzero(d <= max(CONTACT_RADIUS_M, d.min())).astype(np.int32), float(d.min())
+
+
 def contact_readings(
     references: Sequence[Reference], surface: SurfaceMesh, band: Band, place: object = None
 ) -> tuple[ContactReading, ...]:
@@ -60,15 +66,14 @@ def contact_readings(
     for reference in references:
         if not isinstance(reference, ContactReference):
             continue
-        d = np.linalg.norm(surface.vertices_m - reference.p_world_m.astype(np.float32), axis=1)
-        if d.min() > CONTACT_FAR_M:
+        vertices, off_m = under_sensor(surface, reference.p_world_m)
+        if off_m > CONTACT_FAR_M:
             raise ScanError(
-                f"a contact thermometer at {reference.p_world_m.tolist()} m is {d.min() * 100:.0f} cm off the surface",
+                f"a contact thermometer at {reference.p_world_m.tolist()} m is {off_m * 100:.0f} cm off the surface",
                 place=place,
                 hint="p_world_m is a point in the trajectory's world frame",
             )
         T_K = reference.degC + ZERO_DEGC_K
-        vertices = np.flatnonzero(d <= max(CONTACT_RADIUS_M, d.min())).astype(np.int32)
         sigma = float(band.d_radiance_dT(T_K)) * reference.uncertainty_K
         readings.append(ContactReading(vertices, float(band.radiance(T_K)), sigma))
     return tuple(readings)
