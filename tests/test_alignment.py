@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.truth import truth_of
 from support.walkround import ROOM_DEGC, T_THERMAL_DEPTH, blank, ellipsoid, make_scan, repainted, walk
 
 from thermofusion.errors import ScanError
@@ -174,7 +175,7 @@ def test_same_input_same_result_and_switches(body, scan):
 def test_torso_recording(shared_data, rotation_deg, clock_s):
     """The simulated walk round a person, with its true surface: half a degree and 40 ms are found."""
     root = shared_data("torso-dev")
-    truth = np.load(root / "truth" / "surface.npz")
+    truth = truth_of(root)
     mesh = o3d.t.geometry.TriangleMesh(o3d.core.Tensor(truth["vertices_m"]), o3d.core.Tensor(truth["triangles"]))
     mesh.compute_vertex_normals()
     surface = SurfaceMesh(truth["vertices_m"], truth["triangles"], mesh.vertex.normals.numpy())

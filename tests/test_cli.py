@@ -8,6 +8,7 @@ import tomllib
 
 import numpy as np
 import pytest
+from support.truth import truth_of
 
 from thermofusion.cli import main
 from thermofusion.export import read_mesh, read_trajectory
@@ -37,7 +38,7 @@ def demo(tmp_path_factory):
 def test_the_demo_finds_the_true_temperatures(demo):
     """Poses withheld, rig and clock as written, blackbody in three frames; truth at the nearest true vertex."""
     out, report = demo
-    truth = np.load(data_dir() / "demo" / "truth" / "surface.npz")
+    truth = truth_of(data_dir() / "demo")
     mesh = read_mesh(out / "mesh.ply")
     T_true_world = _to_truth(out)
     p = mesh.surface.vertices_m @ T_true_world[:3, :3].T + T_true_world[:3, 3]

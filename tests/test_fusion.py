@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from support.truth import truth_of
 
 from thermofusion.depth.filter import DepthFrames
 from thermofusion.errors import ResourceError, ScanError
@@ -415,7 +416,7 @@ def test_torso_recording_meets_its_bars(shared_data) -> None:
     third = Trajectory(scan.trajectory.times_s[::3], scan.trajectory.T_world_depth[::3])
     result = fuse_along(scan, third, "torso")
     assert result.frames_used == 60
-    truth = np.load(folder / "truth" / "surface.npz")
+    truth = truth_of(folder)
     surface = o3d.t.geometry.RaycastingScene()
     surface.add_triangles(truth["vertices_m"], truth["triangles"].astype(np.uint32))
     near = surface.compute_closest_points(o3d.core.Tensor(result.mesh.vertices_m))

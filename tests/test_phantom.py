@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from support.truth import truth_of
 
 from thermofusion.errors import RecipeError, ScanError
 from thermofusion.files.tum import read_trajectory
@@ -283,7 +284,7 @@ def test_scan_opens_and_says_what_it_should(small):
     scan = open_scan(root)
     assert scan.notes == ()
     assert (len(scan.depth), len(scan.thermal), len(scan.color)) == (24, 8, 6)
-    truth = np.load(root / "truth" / "surface.npz")
+    truth = truth_of(root)
     np.testing.assert_array_equal(np.flatnonzero(scan.thermal.usable), truth["thermal_index"])
     assert 0 < (~scan.thermal.usable).sum() < 4
     np.testing.assert_allclose(
@@ -303,7 +304,7 @@ def test_depth_frames_lie_on_the_true_surface(small):
     from thermofusion.geometry._open3d import o3d
 
     _, root = small
-    scan, truth = open_scan(root), np.load(root / "truth" / "surface.npz")
+    scan, truth = open_scan(root), truth_of(root)
     trajectory = read_trajectory(root / "truth" / "trajectory.txt")
     surface = o3d.t.geometry.RaycastingScene()
     surface.add_triangles(o3d.core.Tensor(truth["vertices_m"]), o3d.core.Tensor(truth["triangles"].astype(np.uint32)))
@@ -330,7 +331,7 @@ def test_truth_projects_to_the_images_through_the_solvers_forward_model(tmp_path
         thermal={"scale": 0.5, "every": 12, "netd_K": 0.03, "psf_sigma_px": 0.0, "drift": {"level_K": 0.5}},
     )
     root = simulate(config, tmp_path / "scan", seed=5)
-    scan, truth = open_scan(root), np.load(root / "truth" / "surface.npz")
+    scan, truth = open_scan(root), truth_of(root)
     phantom = build_phantom(config, seed=5)
     band = SolverBand(*scan.thermal.camera.band_um)
     pose, _ = interpolate_trajectory(scan.trajectory, scan.thermal.times_s)
@@ -453,7 +454,7 @@ def test_isothermal_phantom_is_uniform_after_correction(name, recipe, overrides,
     assert np.percentile(np.abs(error), 95) < 0.10
     # the object is small and in the middle, the blackbody in the corner: what the image field is there nobody saw, the
     # level may be off by a field's size, and the result must say so
-    true_degC = np.median(np.load(tmp_path / "scan" / "truth" / "surface.npz")["temperature_degC"])
+    true_degC = np.median(truth_of(tmp_path / "scan")["temperature_degC"])
     level_error_K = np.median(mesh.temperature_degC[seen]) - true_degC
     assert abs(level_error_K) < 0.35
     assert abs(level_error_K) < 2 * calibration.level_sigma_K
@@ -466,7 +467,7 @@ def test_skin_that_sees_skin_is_not_biased(tmp_path):
 
     config = reduced("folds", scale=1.0, subdivisions=1)
     root = simulate(config, tmp_path / "scan", seed=2)
-    truth = np.load(root / "truth" / "surface.npz")
+    truth = truth_of(root)
     mesh = fuse(open_scan(root), load_recipe("torso")).mesh_in_world
     gap, nearest = cKDTree(truth["vertices_m"]).query(mesh.surface.vertices_m)
     error = mesh.temperature_degC - truth["temperature_degC"][nearest]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support.problems import errors, problem_of
 from support.synthetic_views import BAND, L_ROOM, REFLECTED_K, make_world, vignetting_K
+from support.truth import truth_of
 
 from thermofusion.cli import main
 from thermofusion.errors import RecipeError, ScanError
@@ -189,7 +190,7 @@ def test_validate_from_recording_to_report(ball, tmp_path, capsys):
     assert 0.9 < report["overall"]["within_95"] <= 1.0
     straight = report["by_angle"]["0-20"]
     assert straight["rmse_K"] == pytest.approx(report["noise_K"], rel=0.25)  # an isothermal body: noise is all there is
-    truth = np.load(ball / "truth" / "surface.npz")
+    truth = truth_of(ball)
     assert np.ptp(truth["temperature_degC"]) < 1e-6
     from thermofusion.results.folder import load_mesh
 

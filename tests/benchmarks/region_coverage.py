@@ -26,7 +26,8 @@ ROUNDS, FAR_M = 12, 0.02  # of the fit to the true surface; what is farther from
 
 def truth_on(out: Path, scan: Path, vertices_m: np.ndarray) -> np.ndarray:
     """The true temperature (V,), degC, at the surface nearest to each of vertices_m (V, 3), result fitted to truth."""
-    true = np.load(scan / "truth" / "surface.npz")
+    with np.load(scan / "truth" / "surface.npz") as z:
+        true = dict(z)
     ours, theirs = (read_trajectory(p / "trajectory.txt") for p in (out, scan / "truth"))
     j = np.abs(ours.times_s[:, None] - theirs.times_s).argmin(axis=1)
     T = rigid_alignment(ours.T_world_depth[:, :3, 3], theirs.T_world_depth[j, :3, 3])
