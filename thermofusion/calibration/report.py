@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..report.page import html_page
 from ..report.plot import Area, Axis, Mark, Plot, Points, Rule, page
+from ..report.skeleton import html_page
 from ..types import Float
 from .fit.cameras import INTRINSIC_NAMES, SHIFT, TURN, to_rt
 from .fit.coverage import coverage

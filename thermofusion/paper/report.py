@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 
 from ..files.json import to_json
 from ..files.whole import write_text
-from ..report.page import html_page
 from ..report.plot import Panel, csv_text, page
+from ..report.skeleton import html_page
 
 
 @dataclass(frozen=True)
