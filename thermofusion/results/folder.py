@@ -181,10 +181,11 @@ def load_temperature(folder: Path) -> Temperature:
 
     path = folder / "result.npz"
     if not path.is_file():
-        there = (folder / "stages").is_dir()
-        cause = "the run did not reach the temperature stage" if there else "no finished result is here"
-        command = f"`thermofusion run SCAN -o {shlex.quote(str(folder))}`"
-        raise ScanError(cause, place=folder, hint=f"{command} {'goes on from there' if there else 'writes one'}")
+        if (folder / WORK).is_dir():
+            hint = f"`thermofusion run SCAN -o {shlex.quote(str(folder))}` goes on from there"
+            raise ScanError("the run did not reach the temperature stage", place=folder, hint=hint)
+        hint = "`thermofusion run SCAN -o RESULT` writes one"  # elsewhere: this may be a recording
+        raise ScanError("no finished result is here", place=folder, hint=hint)
     temperature = load_artifact(path)
     if not isinstance(temperature, Temperature):
         raise ScanError(

@@ -24,10 +24,8 @@ FINAL_SAMPLE = 6000  # and a pattern's solution
 FLOOR_K = 0.004  # of agreement: clean scans stay below; scales with the camera's noise beyond 0.04 K
 FLOOR_NETD_K = 0.04
 MIN_Z = 5.0
-DRIFT_OVER_SIZE, FIXED_OVER_SIZE = (
-    6.0,
-    3.0,
-)  # amplitude of a pattern over the agreement that vertices' means leave of it
+# Amplitude of a pattern over the agreement that vertices' means leave of it.
+DRIFT_OVER_SIZE, FIXED_OVER_SIZE = 6.0, 3.0
 LEFT_OVER_SIZE = 2.0  # error of a vertex over the agreement that is left
 JUMP_SIGMAS = 5.0  # a step of the offsets between views beyond this many of their usual steps is a shutter's
 MIN_STRETCH_VIEWS = 4
