@@ -207,7 +207,11 @@ def test_a_closed_surface_keeps_volume_and_area_and_has_a_temperature_everywhere
     assert mesh.measured.all()
     new = np.isnan(mesh.uncertainty_K)
     assert np.abs(mesh.temperature_degC - (30 + 30 * mesh.surface.vertices_m[:, 2]))[~new].max() < 1e-3
-    read = read_mesh(export(result(open_), tmp_path, ["vtk-mesh"])[0])
+    names = [
+        export(result(open_), tmp_path, ["vtk-mesh"], **named)[0].name for named in ({}, {"name": "mesh-apparent"})
+    ]
+    assert names == ["mesh-closed.vtp", "mesh-apparent-closed.vtp"]
+    read = read_mesh(tmp_path / names[0])
     assert (read.temperature_degC == mesh.temperature_degC).all()
 
 

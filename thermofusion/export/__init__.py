@@ -40,7 +40,7 @@ __all__ = [
 ]
 
 MeshFormat = Literal["ply", "glb", "vtp", "csv", "obj", "stl", "vtk-mesh"]
-FILES = {"vtk-mesh": "mesh-closed.vtp"}  # of formats whose file is not mesh.<format>
+FILES = {"vtk-mesh": "{0}-closed.vtp"}  # of formats whose file is not NAME.FORMAT
 _COLORED: dict[str, Callable[[Path, ThermalMesh, str, tuple[float, float] | None], Path]] = {
     "ply": write_ply,
     "glb": write_glb,
