@@ -13,8 +13,8 @@ from thermofusion.physics.emissivity import Fresnel, shape_direction, water
 from thermofusion.recipe import CrosscalSection, MappingSection, TemperatureSection
 from thermofusion.temperature import crosscal
 from thermofusion.temperature.blend import blend
-from thermofusion.temperature.field import ImageField
 from thermofusion.temperature.references import ContactReading, ExpectedReading, expected_readings
+from thermofusion.temperature.sensor.field import ImageField
 from thermofusion.types import BlackbodyReference
 
 SKIN = {"dielectric": Fresnel(1.33), "non-dielectric": Fresnel(1.33, 0.25), "water": water(BAND)}

@@ -13,7 +13,7 @@ from thermofusion.mapping.pixels import bad_pixels
 from thermofusion.physics.signal import SignalConverter
 from thermofusion.scans.check import _automatic_gain
 from thermofusion.temperature import crosscal
-from thermofusion.temperature.pattern import Pattern
+from thermofusion.temperature.sensor.pattern import Pattern
 from thermofusion.types import Camera, ThermalCamera, ThermalStream
 
 SLOPE = float(BAND.d_radiance_dT(306.15))

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..mapping.observe import Mapped
 from ..temperature.crosscal import Calibration
-from ..temperature.pattern import Pattern
+from ..temperature.sensor.pattern import Pattern
 from ..temperature.solve import Temperature
 from ..types import VertexFlag
 

@@ -29,8 +29,8 @@ def stored() -> MappingProxyType[str, type]:
     from ..surface.clean import RemovedPart
     from ..surface.surface import SurfaceResult
     from ..temperature.crosscal import Calibration
-    from ..temperature.field import ImageField
-    from ..temperature.pattern import Pattern
+    from ..temperature.sensor.field import ImageField
+    from ..temperature.sensor.pattern import Pattern
     from ..temperature.solve import Temperature
     from ..tracking.track import LostRange, TrackingResult
     from ..types import (

@@ -19,10 +19,10 @@ from ..physics.emissivity import EmissivityModel, follows_shape
 from ..physics.equation import paper_chain, surface_radiance
 from ..recipe import TemperatureSection
 from ..types import Bool, Float, Float32, Int, Observations, OutputMode
-from .criticism import patches
 from .crosscal import Calibration
 from .mean import Groups, RobustMean, Solved
 from .problem import ThermalProblem
+from .sensor.criticism import patches
 from .surroundings import Room
 from .uncertainty import (
     AngleTables,

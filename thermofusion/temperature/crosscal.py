@@ -28,12 +28,12 @@ from ..physics.emissivity import AngleTable, EmissivityModel, reshaped, shape_di
 from ..physics.equation import without_gain
 from ..robust import MAD_PER_SIGMA, NORMAL_95
 from ..types import Bool, Float, Float32, Observations, brief
-from .field import ImageField
 from .layout import Layout
-from .pattern import Pattern
 from .problem import ThermalProblem
 from .references import ContactReading, ExpectedReading
-from .refine import Refinement, refine
+from .sensor.field import ImageField
+from .sensor.pattern import Pattern
+from .sensor.refine import Refinement, refine
 from .system import SHAPE_BOUNDS, ContactRow, KnownField, OverlapSystem, Solution, condition_number
 from .uncertainty import DEFAULT_SIGMA_NORMAL_DEG, AngleTables, covariance_modes, observation_variance, skin_slope
 

@@ -12,9 +12,9 @@ from scipy.spatial import cKDTree
 
 from ..types import Bool, Float
 from .blend import BlendResult
-from .criticism import patches
 from .crosscal import Calibration
 from .problem import ThermalProblem
+from .sensor.criticism import patches
 from .uncertainty import AngleTables, observation_variance
 
 SAMPLE = 8000  # vertices that the slopes are taken from

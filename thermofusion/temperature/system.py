@@ -16,10 +16,10 @@ from scipy.sparse import csr_matrix
 from ..physics.equation import excess_reading
 from ..robust import HUBER, MAD_PER_SIGMA, TUKEY, huber_weight, tukey_weight
 from ..types import Bool, Float, Int
-from .field import ImageField
 from .layout import Layout
-from .pattern import Pattern
 from .references import ExpectedReading
+from .sensor.field import ImageField
+from .sensor.pattern import Pattern
 
 HUBER_STEPS, TUKEY_STEPS = 4, 40
 CONVERGED_K = 1e-4  # a hundredth of what any result is good to

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.sparse import csr_matrix, hstack
 
-from ..types import Float
+from ...types import Float
 
 FIXED_SPACING = (80 / 640, 27 / 640)  # image widths between the knots of fixed patterns: blotches, and dust
 DRIFT_SPACING = 100 / 640  # image widths between the knots of a drift

@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..robust import SIGMA_PER_MAD
-from ..types import Float, Observations
+from ...robust import SIGMA_PER_MAD
+from ...types import Float, Observations
+from ..problem import ThermalProblem
+from ..system import OverlapSystem, Solution
 from .criticism import Alike, left_out, statistics
 from .pattern import Pattern
-from .problem import ThermalProblem
-from .system import OverlapSystem, Solution
 
 SAMPLE = 2000  # vertices that criticism and judgement need
 FINAL_SAMPLE = 6000  # and a pattern's solution

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from ..types import Bool, Float, Observations
-from .system import OverlapSystem, Solution
+from ...types import Bool, Float, Observations
+from ..system import OverlapSystem, Solution
 
 FLIPS = 48  # sign patterns that a statistic's spread by chance is taken from
 PATCH_M = 0.03  # a patch of skin: its errors (normals, registration) are one cluster

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..types import Float, Int
+from ...types import Float, Int
 
 FIELD_ORDER = 4  # polynomial order
 GRID = 64  # points along each side over which patterns are orthonormal
