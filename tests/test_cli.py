@@ -96,11 +96,12 @@ def test_nothing_is_computed_twice_and_the_plan_says_why(demo, capsys):
     assert plan["tracking"]["reuse"]
     assert plan["surface"]["reuse"]
     assert not plan["temperature"]["reuse"]
-    again = (out / "mesh.ply").read_bytes()
+    again = [(out / name).read_bytes() for name in ("mesh.ply", "result.npz")]
+    assert not (out / "stages" / "temperature.npz").exists()  # result.npz holds it
     code, text, _ = call(capsys, "run", scan, "-r", "torso", "-o", out, "--json")
     assert code == 0
     assert json.loads(text)["stages_reused"] == ["tracking", "surface", "rig", "mapping", "temperature"]
-    assert (out / "mesh.ply").read_bytes() == again
+    assert [(out / name).read_bytes() for name in ("mesh.ply", "result.npz")] == again
 
 
 def test_export_writes_other_formats_palettes_and_modes(demo, tmp_path, capsys):

@@ -121,3 +121,16 @@ def test_resumed_is_fresh(key, field, scan, first, tmp_path):
     assert resumed.keys() == fresh.keys()
     for name in fresh:
         np.testing.assert_array_equal(resumed[name], fresh[name], err_msg=name)
+
+
+def test_a_finished_result_is_taken_back_into_the_world(scan, tmp_path):
+    """`result.npz` stands upright; a run that goes on from it hands out the same as one that computes."""
+    upright = load_recipe({}, [*BASE, "output.frame=upright"])
+    world = load_recipe({}, [*BASE, "output.frame=world"])
+    fuse(scan, upright, out=tmp_path)
+    resumed, fresh = fuse(scan, world, out=tmp_path), fuse(scan, world)
+    assert resumed.report["stages_reused"][-1] == "temperature"
+    assert resumed.report["run"] == fresh.report["run"] == resumed.mesh.metadata["run"]
+    assert resumed.mesh.metadata == fresh.mesh.metadata
+    np.testing.assert_array_equal(resumed.mesh.surface.vertices_m, fresh.mesh.surface.vertices_m)
+    np.testing.assert_array_equal(resumed.mesh.temperature_degC, fresh.mesh.temperature_degC)

@@ -9,6 +9,7 @@
 from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +19,7 @@ from .progress import Progress, silent
 from .recipe import RENAMED_STAGES, Recipe
 from .report.summary import Steps, summary
 from .results.claim import claimed
-from .results.folder import Result, add_files, load_mesh, names_of, write_result
+from .results.folder import RESULT, Result, add_files, load_mesh, names_of, write_result
 from .results.frame import frame_of
 from .results.stages import Computes, Stage, StagePlan, Stages, fingerprint, run_id
 from .scans.check import verify
@@ -34,7 +35,7 @@ STAGES = (
     Stage("surface", ("input", "subject", "surface")),
     Stage("rig", ("input", "rig")),
     Stage("mapping", ("input", "mapping"), edition=2),
-    Stage("temperature", ("mapping", "temperature"), edition=3),
+    Stage("temperature", ("mapping", "temperature"), edition=3, handed_out=RESULT),
 )
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
 
@@ -65,7 +66,8 @@ def fuse(
         return run.result()
     with claimed(run.folder, scan, names_of(recipe), overwrite=overwrite) as left:
         result = run.result()
-        write_result(result, recipe, run.folder, left, run.casts)
+        finished = None if result.mapped is None else (STAGES[-1].file, run.stages.note)
+        write_result(result, recipe, run.folder, left, run.casts, finished)
         return result
 
 
@@ -131,6 +133,8 @@ class _Run:
         # 4. Temperature, while the pictures' rays are cast on the other core
         self.cast(Steps(tracking, surface))
         temperature = step("temperature", partial(solve, scan, mesh, mapped, normal_window_m=window_m))
+        if temperature is not None:  # a finished result's stands in the result's frame
+            temperature = replace(temperature, mesh=replace(temperature.mesh, surface=mesh))
         return Steps(tracking, surface, rig, mapped, temperature)
 
     def step(self, name: str, compute: Computes) -> Any:

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from ..report.casts import Cast
     from ..temperature.solve import Temperature
 
+RESULT = "result.npz"  # the temperature stage's artifact, in the result's frame
+
 
 @dataclass(frozen=True, eq=False)
 class Result(Steps):
@@ -57,7 +59,7 @@ class Result(Steps):
         facts = {"version": __version__, "recipe": recipe.name, "frame": WORLD, **frame.axes}
         facts |= {"scan": scan.name, "run": run}
         facts |= {} if scan.recorded_at is None else {"recorded_at": scan.recorded_at}
-        mesh = replace(mesh, metadata={**facts, **mesh.metadata})
+        mesh = replace(mesh, metadata={**facts, **mesh.metadata, **facts})  # a reused mesh tells of an earlier run
         return cls(**vars(steps), report=report, frame=frame, world_mesh=mesh)
 
     def __repr__(self) -> str:
@@ -100,18 +102,23 @@ class Result(Steps):
 
 def names_of(recipe: Recipe) -> list[str]:
     """The files that a finished run writes, but for its stages."""
-    names = ["recipe.resolved.toml", "trajectory.txt", "result.npz", REPORT]
+    names = ["recipe.resolved.toml", "trajectory.txt", RESULT, REPORT]
     names += [f"mesh.{f}" for f in recipe.output.formats] + [PAGE] * recipe.output.report
     return [*names, *(f"{VIEWS}/{v}.png" for v in (*FACES, "overview", *DOUBTS) if recipe.output.views)]
 
 
 def write_result(
-    result: Result, recipe: Recipe, folder: Path, left: Sequence[str] = (), casts: Future[list[Cast]] | None = None
+    result: Result,
+    recipe: Recipe,
+    folder: Path,
+    left: Sequence[str] = (),
+    casts: Future[list[Cast]] | None = None,
+    last: tuple[str, dict[str, Any]] | None = None,
 ) -> None:
     """The result folder's files (docs/formats.md), changed over together: `result.json` goes first and comes last.
 
     left : files of an earlier result; those that this one does not write are removed. casts : the pictures' rays, if
-    they were cast meanwhile.
+    they were cast meanwhile. last : the last stage's file and note; `result.npz` takes its place.
     """
     from ..export import export, write_trajectory
     from ..report.pictures import write_views
@@ -125,7 +132,7 @@ def write_result(
             mesh = result.mesh
             export(mesh, new, tuple(output.formats), palette=output.palette, range_degC=output.range_degC)
             shown = replace(result.temperature, mesh=mesh)
-            save_artifact(new / "result.npz", shown)
+            save_artifact(new / RESULT, shown, None if last is None else last[1])
             if output.views:
                 cast = None if casts is None else casts.result()
                 range_degC = output.range_degC
@@ -139,7 +146,8 @@ def write_result(
         files = sorted(p.relative_to(new).as_posix() for p in new.rglob("*") if p.is_file())
         write_text(new / REPORT, to_json({**result.report, "files": [*files, REPORT]}))
         write_text(folder / CHANGING, to_json(sorted({*left, *files, REPORT})))
-    for name in {*left, CHANGING} - {*files, REPORT}:
+    superseded = [] if last is None or result.temperature is None else [last[0]]
+    for name in {*left, *superseded, CHANGING} - {*files, REPORT}:
         (folder / name).unlink(missing_ok=True)
 
 
@@ -166,7 +174,7 @@ def report_of(folder: Path, regions: Sequence[Region] = ()) -> Reported:
 
 def hashes_of(folder: Path) -> dict[str, str]:
     """SHA-256 of the files that hold a result, by name."""
-    names = (*(f"mesh.{suffix}" for suffix in ("ply", "glb", "vtp", "csv")), "result.npz", "recipe.resolved.toml")
+    names = (*(f"mesh.{suffix}" for suffix in ("ply", "glb", "vtp", "csv")), RESULT, "recipe.resolved.toml")
     return {n: sha256(read_whole(folder / n)).hexdigest() for n in names if (folder / n).is_file()}
 
 
@@ -179,7 +187,7 @@ def load_temperature(folder: Path) -> Temperature:
     """The temperatures of a finished result. Raises ScanError."""
     from ..temperature.solve import Temperature
 
-    path = folder / "result.npz"
+    path = folder / RESULT
     if not path.is_file():
         if (folder / WORK).is_dir():
             hint = f"`thermofusion run SCAN -o {shlex.quote(str(folder))}` goes on from there"

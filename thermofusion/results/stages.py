@@ -41,11 +41,18 @@ class Stage:
     """A step of the method.
 
     reads : the recipe sections that it is handed, and that its key holds. edition : raised when its numbers change.
+    handed_out : the file of a finished result that holds the stage's artifact instead of a file of its own.
     """
 
     name: str
     reads: tuple[str, ...]
     edition: int = 1
+    handed_out: str = ""
+
+    @property
+    def file(self) -> str:
+        """Where its artifact is stored in a result folder."""
+        return f"{WORK}/{self.name}.npz"
 
     def sections(self, recipe: Recipe) -> dict[str, Any]:
         """What the stage reads of a recipe, by name."""
@@ -71,53 +78,62 @@ class Stages:
     """Runs stages in order and remembers their results in a folder (or not at all, without a folder)."""
 
     def __init__(self, folder: Path | None, base: Mapping[str, Any], recipe: Recipe) -> None:
-        self._folder = None if folder is None else folder / WORK
+        self._folder = folder
         self._base, self._recipe = dict(base), recipe
         self.key = _hash(base)
+        self.note: dict[str, Any] = {}
         self.reused: list[str] = []
 
     def run(self, stage: Stage, compute: Computes[T], progress: Progress, *, anew: bool = False) -> T:
         """The stage's result: stored, if its key still fits; else computed, and stored. anew : whatever is stored."""
-        plan, inputs = self.plan(stage, anew=anew), self._inputs(stage)
-        artifact = None if self._folder is None else self._folder / f"{stage.name}.npz"
-        if plan.reuse and artifact is not None:
+        stored, _ = self._look(stage, anew)
+        self.note = {"key": self.key, "inputs": self._inputs(stage)}
+        if stored is not None:
             try:
-                value = load_artifact(artifact)
+                value = load_artifact(stored)
                 self.reused.append(stage.name)
                 return value
             except ScanError:
                 pass  # damaged since its key was read: compute again
         value = compute(**stage.sections(self._recipe), progress=progress)
-        if artifact is not None:
-            save_artifact(artifact, value, {"key": self.key, "inputs": inputs})
+        if self._folder is not None:
+            save_artifact(self._folder / stage.file, value, self.note)
         return value
 
     def plan(self, stage: Stage, *, anew: bool = False) -> StagePlan:
         """What `run` would do, without doing it; the next stage's key goes on from here."""
+        stored, why = self._look(stage, anew)
+        return StagePlan(stage.name, stored is not None, why)
+
+    def _look(self, stage: Stage, anew: bool) -> tuple[Path | None, str]:
+        """The file whose artifact is as good as computing, and why it is, or why there is none."""
         sections = plain(stage.sections(self._recipe))
         self.key = _hash({"before": self.key, "stage": stage.name, "edition": stage.edition, "inputs": sections})
         if self._folder is None:
-            return StagePlan(stage.name, False, "nothing is stored")
+            return None, "nothing is stored"
         if anew:
-            return StagePlan(stage.name, False, "asked for")
-        artifact = self._folder / f"{stage.name}.npz"
-        if not artifact.is_file():
-            return StagePlan(stage.name, False, "not computed yet")
-        try:
-            note = load_note(artifact)
-        except ScanError:
-            return StagePlan(stage.name, False, "what is stored cannot be read")
-        if note.get("key") == self.key:
-            return StagePlan(stage.name, True, "inputs unchanged")
-        now, then = self._inputs(stage), note.get("inputs", {})
-        changed = sorted(k for k in now.keys() | then.keys() if now.get(k) != then.get(k))
-        return StagePlan(stage.name, False, f"changed: {', '.join(changed)}" if changed else "an earlier stage changed")
+            return None, "asked for"
+        why = "not computed yet"
+        for artifact in (self._folder / name for name in (stage.file, stage.handed_out) if name):
+            if not artifact.is_file():
+                continue
+            try:
+                note = load_note(artifact)
+            except ScanError:
+                why = "what is stored cannot be read"
+                continue
+            if note.get("key") == self.key:
+                return artifact, "inputs unchanged"
+            now, then = self._inputs(stage), note.get("inputs", {})
+            changed = sorted(k for k in now.keys() | then.keys() if now.get(k) != then.get(k))
+            why = f"changed: {', '.join(changed)}" if changed else "an earlier stage changed"
+        return None, why
 
     def tidy(self) -> None:
         """Remove what an earlier version stored under other names."""
         if self._folder is not None:
             for name in STALE:
-                (self._folder / name).unlink(missing_ok=True)
+                (self._folder / WORK / name).unlink(missing_ok=True)
 
     def _inputs(self, stage: Stage) -> dict[str, Any]:
         inputs = {**self._base, "edition": stage.edition, **_flat(plain(stage.sections(self._recipe)))}
