@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 import tomllib
 
@@ -74,7 +75,7 @@ def test_links_lead_somewhere(page):
             assert (page.parent / target).exists(), f"{page.name}: {target}"
 
 
-def test_readmes_python_runs_and_writes(tmp_path, monkeypatch):
+def test_readmes_python_and_the_notebook_run(tmp_path, monkeypatch):
     """As it stands, on an excerpt of the demo under the name that it uses."""
     pytest.importorskip("pandas")
     import thermofusion as tf
@@ -88,6 +89,16 @@ def test_readmes_python_runs_and_writes(tmp_path, monkeypatch):
     exec(compile(code, "README.md", "exec"), {})
     names = {p.name for p in (tmp_path / "result").iterdir()}
     assert {"mesh.ply", "mesh.glb", "result.json", "views", "skin.csv"} <= names
+
+    # the notebook's cells, on the same excerpt; what they show was shown by the whole demo
+    cells = json.loads((ROOT / "docs" / "example.ipynb").read_text(encoding="utf-8"))["cells"]
+    sources = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    assert all(cell["outputs"] for cell in cells if cell["cell_type"] == "code")
+    room = {}
+    for source in sources:
+        exec(compile(source.replace('data_dir() / "demo"', '"my-scan"'), "example.ipynb", "exec"), room)
+    assert len(room["measured"].differences) == 1
+    assert room["picture"].size[0] > 500
 
 
 def test_shipped_data_are_registered_with_their_hashes():

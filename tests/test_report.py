@@ -116,6 +116,7 @@ def test_maps_palettes_views_and_sides_show_something_of_their_own(used):
             "color"} == set(seen["maps"])  # fmt: skip
     assert all(seen["changes"].values()), seen["changes"]
     assert seen["same_again"]
+    assert seen["cut"]["cut_z_m"] <= seen["cut"]["whole_z_m"] - 0.01  # the far side, seen through the cut
     assert seen["sides"] == {"front": "RL", "back": "LR"}
 
 

@@ -69,6 +69,11 @@ await page.click("#display summary");
 for (const id of ["shaded", "flagged", "beyond"]) { await page.check(`#${id}`); if (id !== "beyond") await differs(id); await page.uncheck(`#${id}`); }
 await page.fill("#isotherms", "0.5"); await page.locator("#isotherms").blur(); await differs("isotherms");
 await page.fill("#isotherms", "0"); await page.locator("#isotherms").blur();
+const middle = () => page.evaluate(() => { const c = document.getElementById("body"); return thermofusion.pick(c.clientWidth / 2, c.clientHeight / 2); });
+const whole = await middle();
+await page.selectOption("#cut", "front"); await differs("cut");
+seen.cut = { whole_z_m: whole.point[2], cut_z_m: (await middle())?.point[2] };
+await page.selectOption("#cut", "");
 await page.click("#display summary");
 for (const [key, name] of [["2", "back"], ["3", "left"], ["5", "soles"]]) { await page.keyboard.press(key); await differs(name); }
 seen.sides = await page.evaluate(() => { const out = {}; for (const v of ["front", "back"]) { thermofusion.view(v); thermofusion.rendered(); out[v] = document.getElementById("side-left").textContent + document.getElementById("side-right").textContent; } return out; });

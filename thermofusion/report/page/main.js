@@ -370,6 +370,9 @@ function listen() {
   uniform("beyond", "beyond", (t) => Number(t.checked));
   uniform("flagged", "flagged", (t) => Number(t.checked));
   uniform("shaded", "shade", (t) => (t.checked ? 0.45 : 0));
+  const cut = () => body.cut($("cut").value || null, Number($("cut-share").value) / 100);
+  on("cut", "change", cut);
+  on("cut-share", "input", cut);
   on("cameras", "change", (e) => { body.cameras.visible = e.target.checked; body.draw(); });
   for (const b of document.querySelectorAll("[data-view]")) b.addEventListener("click", () => body.view(b.dataset.view));
   for (const b of document.querySelectorAll("[data-tool]")) b.addEventListener("click", () => tool(b.dataset.tool));

@@ -2,7 +2,7 @@
 
 import {
   BackSide, BufferAttribute, BufferGeometry, DataTexture, DoubleSide, GLSL3, LinearSRGBColorSpace, LineBasicMaterial,
-  LineSegments, Mesh, NearestFilter, OrthographicCamera, RGBAFormat, Scene, ShaderMaterial, Vector3, WebGLRenderer,
+  LineSegments, Mesh, NearestFilter, OrthographicCamera, RGBAFormat, Scene, ShaderMaterial, Vector3, Vector4, WebGLRenderer,
 } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
@@ -11,23 +11,24 @@ export const VIEWS = { front: [0, 0, 1], back: [0, 0, -1], left: [1, 0, 0], righ
 
 const VERTEX = `
 in float value; in vec2 mark; in vec3 skin;
-out float vValue; out vec2 vMark; out vec3 vSkin; out vec3 vNormal;
+out float vValue; out vec2 vMark; out vec3 vSkin; out vec3 vNormal; out vec3 vPlace;
 void main() {
-  vValue = value; vMark = mark; vSkin = skin; vNormal = normal;
+  vValue = value; vMark = mark; vSkin = skin; vNormal = normal; vPlace = position;
   gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0);
 }`;
 
 // Grey stripes: skin without a value, and the surface seen from inside, as in the PNG views.
 const FRAGMENT = `
 precision highp float;
-uniform sampler2D palette; uniform float lo, hi, middle, step_, shade, px; uniform int kind, beyond, flagged; uniform vec3 eye;
-in float vValue; in vec2 vMark; in vec3 vSkin; in vec3 vNormal;
+uniform sampler2D palette; uniform float lo, hi, middle, step_, shade, px; uniform int kind, beyond, flagged; uniform vec3 eye; uniform vec4 cut;
+in float vValue; in vec2 vMark; in vec3 vSkin; in vec3 vNormal; in vec3 vPlace;
 out vec4 color;
 bool stripe(float period, float sign_, float width) {
   return mod(gl_FragCoord.x + sign_ * gl_FragCoord.y, period * px) < width * px;
 }
 void main() {
   vec3 c;
+  if (dot(vPlace, cut.xyz) > cut.w) discard;
   if (!gl_FrontFacing) c = stripe(8.0, -1.0, 4.0) ? vec3(0.33) : vec3(0.44);
   else if (kind == 1) c = vSkin;
   else if (vMark.x < 0.999) c = stripe(8.0, 1.0, 4.0) ? vec3(0.745) : vec3(0.886);
@@ -48,7 +49,9 @@ void main() {
 
 const HULL = `
 uniform vec2 size; uniform float px;
+out vec3 vPlace;
 void main() {
+  vPlace = position;
   vec4 p = projectionMatrix * modelViewMatrix * vec4(position, 1.0);
   vec2 n = (projectionMatrix * modelViewMatrix * vec4(normal, 0.0)).xy * size;
   p.xy += normalize(n + 1e-9) * ${OUTLINE_PX.toFixed(1)} * px * 2.0 / size;
@@ -73,12 +76,13 @@ export class Body3D {
     this.uniforms = {
       palette: { value: null }, lo: { value: 0 }, hi: { value: 1 }, middle: { value: 0 }, step_: { value: 0 }, shade: { value: 0 },
       px: { value: 1 }, kind: { value: 0 }, beyond: { value: 0 }, flagged: { value: 0 }, eye: { value: new Vector3(0, 0, 1) },
+      cut: { value: new Vector4(0, 0, 0, 1) },
     };
     const material = new ShaderMaterial({ glslVersion: GLSL3, vertexShader: VERTEX, fragmentShader: FRAGMENT, uniforms: this.uniforms, side: DoubleSide });
     this.size = { value: [1, 1] };
     const hull = new ShaderMaterial({
-      glslVersion: GLSL3, vertexShader: HULL, side: BackSide, uniforms: { size: this.size, px: this.uniforms.px },
-      fragmentShader: "out vec4 color; void main() { color = vec4(0.16, 0.16, 0.17, 1.0); }",
+      glslVersion: GLSL3, vertexShader: HULL, side: BackSide, uniforms: { size: this.size, px: this.uniforms.px, cut: this.uniforms.cut },
+      fragmentShader: "uniform vec4 cut; in vec3 vPlace; out vec4 color; void main() { if (dot(vPlace, cut.xyz) > cut.w) discard; color = vec4(0.16, 0.16, 0.17, 1.0); }",
     });
     this.scene.add(new Mesh(g, hull), new Mesh(g, material));
     this.scene.children.forEach((m) => (m.frustumCulled = false));
@@ -184,6 +188,14 @@ export class Body3D {
     this.onDraw();
   }
 
+  /** Hide what lies beyond a plane: `from` a side of VIEWS (the soles' is from below) or "top", a share of the extent away; null: nothing. */
+  cut(from, share) {
+    const d = from === null ? [0, 0, 0] : from === "top" ? [0, 1, 0] : VIEWS[from];
+    const ends = [-1, 1].map((s) => d.reduce((sum, x, k) => sum + x * this.centre[k] + (s * Math.abs(x) * this.extent[k]) / 2, 0));
+    this.uniforms.cut.value.set(...d, from === null ? 1 : ends[1] - share * (ends[1] - ends[0]));
+    this.draw();
+  }
+
   /** Turn by angles, rad: round the body's height, and up. */
   turn(azimuth, polar) {
     const p = this.camera.position.clone().sub(this.controls.target), r = p.length();
@@ -201,7 +213,8 @@ export class Body3D {
 
   /** The skin under a point of the canvas (CSS px from its corner), and which pane it is in. */
   pick(x, y) {
-    const ray = this.ray(x, y), found = this.skin.hit(ray.origin, ray.direction);
+    const ray = this.ray(x, y), [a, b, c, w] = this.uniforms.cut.value.toArray();
+    const found = this.skin.hit(ray.origin, ray.direction, (p) => a * p.x + b * p.y + c * p.z <= w);
     return found && { ...found, pane: ray.pane };
   }
 

@@ -40,10 +40,12 @@ export class Surface {
   point(i) { return [this.vertices[3 * i], this.vertices[3 * i + 1], this.vertices[3 * i + 2]]; }
   normal(i) { return [this.normals[3 * i], this.normals[3 * i + 1], this.normals[3 * i + 2]]; }
 
-  /** The first skin on a ray, or null: its point, triangle, corners, barycentric weights (in double precision). */
-  hit(origin, direction) {
+  /** The first skin on a ray that is `shown` (a predicate on points), or null: its point, triangle, corners, barycentric weights (in double precision). */
+  hit(origin, direction, shown = () => true) {
     const ray = new Ray(new Vector3(...origin), new Vector3(...direction));
-    const found = this.bvh.raycastFirst(ray, DoubleSide);
+    let found = this.bvh.raycastFirst(ray, DoubleSide);
+    if (found && !shown(found.point))
+      found = this.bvh.raycast(ray, DoubleSide).filter((f) => shown(f.point)).sort((f, g) => f.distance - g.distance)[0];
     return found ? this.#place(found.point.toArray(), found.faceIndex) : null;
   }
 
