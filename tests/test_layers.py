@@ -44,9 +44,10 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "handover": (*BASE, "export", "regions", "report"),
     "judge": ALL,
     "calibration": (*BASE, "physics", "scans", "report"),
+    "recording": (*BASE, "physics", "scans"),
     "phantom": (*NOUNS, "files", "geometry"),
     "paper": (*ALL, "judge", "phantom"),
-    "cli": (*ALL, "judge", "calibration", "phantom", "paper", "handover"),
+    "cli": (*ALL, "judge", "calibration", "recording", "phantom", "paper", "handover"),
     "__init__": ALL,
     "__main__": ("cli", "errors"),
 }
@@ -54,7 +55,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
 CALIBRATION = {"board": (), "detect": ("board",), "fit": ("board", "detect"), "thermal": ()}
 # A module of one room that another may use, although the room itself is closed to it.
 PHANTOM_GEOMETRY = {"geometry.rigid", "geometry._open3d"}
-ONE_PLACE = {"usb": {"cli/doctor.py"}, "typer": {"cli"}, "rich": {"cli"}}
+ONE_PLACE = {"usb": {"recording"}, "typer": {"cli"}, "rich": {"cli"}}
 PRINTS_OR_EXITS = ("print", "sys.exit", "exit", "quit")
 MOST_FILES, MOST_ON_TOP, MOST_LINES, MOST_ARGUMENTS, MANY_ARGUMENTS, WITH_MANY = 16, 10, 60, 9, 7, 4
 

@@ -7,22 +7,10 @@ import os
 import platform
 import sys
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
-# Cameras by USB vendor and product (docs/capture facts are public; nothing here was checked on hardware).
-KNOWN_DEVICES = {
-    (0x045E, 0x02B0): "Kinect v1 motor",
-    (0x045E, 0x02AD): "Kinect v1 audio",
-    (0x045E, 0x02AE): "Kinect v1 camera",
-    (0x045E, 0x02BF): "Kinect for Windows camera",
-    (0x3474, 0x45A2): "Thermal Master P3",
-    (0x3474, 0x45C2): "Thermal Master P1",
-    (0x0BDA, 0x5830): "InfiRay P2 Pro / Topdon TC001",
-    (0x1E4E, 0x0100): "PureThermal (FLIR Lepton)",
-    (0x289D, 0x0010): "Seek Compact",
-    (0x289D, 0x0011): "Seek Compact Pro",
-}
+from ..errors import ResourceError
+
 PACKAGES = (
     "open3d",
     "numpy",
@@ -94,22 +82,19 @@ def _memory() -> Examined:
 
 
 def _usb() -> list[Examined]:
-    try:
-        import libusb_package
-        import usb.core
+    from ..recording.devices import KNOWN
+    from ..recording.usb import may_open, usb_devices
 
-        devices = list(usb.core.find(find_all=True, backend=libusb_package.get_libusb1_backend()) or [])
-    except Exception as e:
-        return [
-            Examined("usb", "warning", f"the bus cannot be listed ({type(e).__name__}: {e}); recording will not work")
-        ]
+    try:
+        devices = usb_devices()
+    except ResourceError as e:
+        return [Examined("usb", "warning", f"{e.cause}; recording will not work")]
     found = []
     for device in devices:
-        name = KNOWN_DEVICES.get((device.idVendor, device.idProduct))
+        name = KNOWN.get((device.idVendor, device.idProduct))
         if name is None:
             continue
-        node = Path(f"/dev/bus/usb/{device.bus:03d}/{device.address:03d}")
-        allowed = not node.exists() or os.access(node, os.R_OK | os.W_OK)
-        hint = "" if allowed else f"; no permission on {node}: add a udev rule for it"
+        allowed = may_open(device)
+        hint = "" if allowed else "; no permission to open it: `thermofusion doctor --udev FILE` writes the rule"
         found.append(Examined("usb", "ok" if allowed else "problem", f"{name} at {device.bus}:{device.address}{hint}"))
     return found or [Examined("usb", "ok", f"{len(devices)} devices on the bus, no camera known to thermofusion")]

@@ -1,4 +1,4 @@
-"""Verbs that look and change nothing: doctor, check, recipe."""
+"""Verbs that look and change nothing: doctor, devices, check, recipe."""
 
 from __future__ import annotations
 
@@ -19,18 +19,53 @@ recipes = typer.Typer(
 def register(app: typer.Typer) -> None:
     """Add this module's verbs."""
     app.command()(doctor)
+    app.command()(devices)
     app.command()(check)
     app.add_typer(recipes, name="recipe")
 
 
-def doctor(json: Json = False) -> int:
+def doctor(
+    udev: Annotated[
+        Path | None, typer.Option(help="Write the udev rule that lets you open the cameras to this file.")
+    ] = None,
+    json: Json = False,
+) -> int:
     """Versions, libraries, memory, cameras and USB permissions: what works here."""
     from .doctor import examine
 
+    if udev is not None:
+        from ..files.whole import write_text
+        from ..recording.devices import KNOWN
+        from ..recording.udev import RULES_FILE, udev_rules
+
+        write_text(udev, udev_rules(KNOWN))
+        note(f"wrote {udev}; its first lines say how it is put into {RULES_FILE}")
     findings = examine()
     sign = {"ok": "ok     ", "warning": "warning", "problem": "PROBLEM"}
     emit(findings, "\n".join(f"{sign[f.status]}  {f.subject}: {f.text}" for f in findings), json)
     return 5 if any(f.status == "problem" for f in findings) else 0
+
+
+def devices(json: Json = False) -> None:
+    """The cameras on the USB bus that `record` knows, and whether they may be opened."""
+    from ..recording.devices import cameras
+    from ..recording.usb import may_open
+
+    rows = [
+        {
+            "name": c.name,
+            "usb": f"{c.ids[0]:04x}:{c.ids[1]:04x}",
+            "bus": c.bus,
+            "address": c.address,
+            "may_open": may_open(c.usb),
+        }
+        for c in cameras()
+    ]
+    lines = [
+        f"{r['name']} ({r['usb']} at {r['bus']}:{r['address']}){'' if r['may_open'] else ': no permission'}"
+        for r in rows
+    ]
+    emit({"devices": rows}, "\n".join(lines) or "no camera known to thermofusion is on the USB bus", json)
 
 
 def check(
