@@ -106,6 +106,23 @@ def test_right_rig_is_left_alone(body, scan):
     assert result.messages == ()  # no news
     assert result.residual_px_before == pytest.approx(result.residual_px_after)
     assert result.residual_px_before < 0.3
+    assert result.frame_dt_s is None
+
+
+@pytest.mark.parametrize(("rotation_deg", "left_s"), [([0, 0, 0], 0.005), ([0.3, -0.3, 0.26], 0.01)])
+def test_jitter_of_single_frames_is_solved_beside_the_rig(body, scan, rotation_deg, left_s):
+    wrong = turned(scan, rotation_deg)
+    jitter_s = np.random.default_rng(8).normal(0, 0.03, len(scan.thermal))
+    times_s = wrong.thermal.times_s + jitter_s
+    result = aligned(replace(wrong, thermal=replace(wrong.thermal, times_s=times_s)), body, walk())
+    assert result.frame_dt_s is not None
+    # a steady part of what is left goes with the rig: 10 px a second are slow for this camera
+    assert np.std(jitter_s + result.camera.time_offset_s + result.frame_dt_s) < left_s
+    assert result.jitter_s == pytest.approx(np.std(jitter_s), rel=0.4)
+    assert result.residual_px_after < 0.2
+    assert errors(result, T_THERMAL_DEPTH)[0] < 0.1
+    assert inside_covariance(result)
+    assert "jitter" in result.messages[-1]
 
 
 def test_the_sensors_own_offset_is_the_start(body, scan):

@@ -25,6 +25,7 @@ VOCABULARY = MappingProxyType(
         "readings agree by place in the image": "record more views in which the same skin crosses the whole image",
         "surface that is not skin": "take off what can be taken off; its temperature is not the skin's",
         "dead pixels": "have the camera's list of bad pixels renewed",
+        "time stamps jitter": "let camera or software stamp each thermal frame when it is taken, not when it is stored",
         "outlines do not fit": "check the thermal clock, the rig and that nobody moved; repeat the scan more slowly",
         "references contradict each other": "let references and camera warm up, and show them in more frames",
     }
@@ -33,7 +34,7 @@ VOCABULARY = MappingProxyType(
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """One fault. size_K : its effect on readings, K; None where it has none that is known."""
+    """One fault. size_K : its effect on readings, K, None where none is known. size : the fault's own, in `unit`."""
 
     what: str
     evidence: str
@@ -41,10 +42,14 @@ class Diagnosis:
     where: str
     done: str
     advice: str = ""
+    size: float | None = None
+    unit: str = ""
 
     def line(self) -> str:
         """For the terminal."""
-        size = "" if self.size_K is None else f" ({self.size_K:.2f} K)"
+        sizes = [] if self.size is None else [f"{self.size:.3g} {self.unit}"]
+        sizes += [] if self.size_K is None else [f"{self.size_K:.2f} K"]
+        size = f" ({', '.join(sizes)})" if sizes else ""
         return f"{self.what}{size}, {self.where}: {self.done}; {self.advice}"
 
 
@@ -66,6 +71,12 @@ def diagnose(mapped: Mapped, temperature: Temperature, image_px: tuple[int, int]
         share = len(mapped.bad_pixels) / (image_px[0] * image_px[1])
         evidence = f"{len(mapped.bad_pixels)} pixels ({share:.2%}) stand outside their neighbours in frame after frame"
         found.append(Diagnosis("dead pixels", evidence, None, "single pixels", "left out"))
+    if mapped.jitter_s > 0:
+        text = f"outlines of single views stand where they belong {1e3 * mapped.jitter_s:.0f} ms earlier or later"
+        done = "each frame's time was solved for from its outline"
+        found.append(
+            Diagnosis("time stamps jitter", text, None, "thermal frames", done, size=1e3 * mapped.jitter_s, unit="ms")
+        )
     if mapped.outline_px > OUTLINE_PX:
         evidence = (
             f"{mapped.outline_px:.2f} px between the outlines of model and image (clean scans: below {OUTLINE_PX})"

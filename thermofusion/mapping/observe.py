@@ -91,6 +91,7 @@ class Mapped:
     left_out : thermal frames that did not enter, by reason. motion : corrections of single views, if asked for.
     bad_pixels : (B, 2) u, v px of dead, stuck or blinking pixels, which were left out.
     outline_px : what the rig's alignment left between the outlines of model and image, NaN = not measured.
+    jitter_s : one sigma of what single thermal frames' stamps lacked and was put right.
     """
 
     views: ThermalViews
@@ -100,6 +101,7 @@ class Mapped:
     motion: MotionResult | None = None
     bad_pixels: Int = field(default_factory=lambda: np.zeros((0, 2), np.int32))
     outline_px: float = float("nan")
+    jitter_s: float = 0.0
 
     __repr__ = brief
 
@@ -118,7 +120,7 @@ def observe(
 
     Raises ScanError if no thermal frame can be placed, or no view sees the surface.
     """
-    views, left_out = thermal_views(scan, trajectory, input.max_pose_gap_ms / 1e3, rig.camera)
+    views, left_out = thermal_views(scan, trajectory, input.max_pose_gap_ms / 1e3, rig.camera, rig.frame_dt_s)
     assert scan.thermal is not None
     stream, motion = scan.thermal, None
     if mapping.view_motion:
@@ -131,7 +133,7 @@ def observe(
     observations = observe_views(stream, SurfaceRays(surface), views, converter, mapping, progress=progress)
     blackbodies = read_blackbodies(stream, views, scan.references, converter)
     uv = np.argwhere(bad)[:, ::-1].astype(np.int32)
-    return Mapped(views, left_out, observations, blackbodies, motion, uv, rig.residual_px_after)
+    return Mapped(views, left_out, observations, blackbodies, motion, uv, rig.residual_px_after, rig.jitter_s)
 
 
 def observe_views(

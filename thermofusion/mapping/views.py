@@ -6,7 +6,7 @@ import numpy as np
 
 from ..errors import ScanError
 from ..geometry.rigid import interpolate_trajectory, invert
-from ..types import Scan, ThermalCamera, ThermalViews, Trajectory
+from ..types import Float, Scan, ThermalCamera, ThermalViews, Trajectory
 
 # Why a thermal frame did not enter the result: the keys of `thermal_views`' counts.
 SHUTTER = "shutter"  # taken during, or just after, a shutter correction, or rejected by the reader
@@ -15,21 +15,26 @@ NO_POSE = "no pose"  # inside a gap of the trajectory longer than allowed: track
 
 
 def thermal_views(
-    scan: Scan, trajectory: Trajectory, max_pose_gap_s: float, camera: ThermalCamera | None = None
+    scan: Scan,
+    trajectory: Trajectory,
+    max_pose_gap_s: float,
+    camera: ThermalCamera | None = None,
+    frame_dt_s: Float | None = None,
 ) -> tuple[ThermalViews, dict[str, int]]:
     """The thermal frames that have a pose, and how many were left out, by reason.
 
     A thermal frame's time on the depth clock is its own time + `time_offset_s`; there the trajectory is interpolated
     on SE(3), and T_world_thermal = T_world_depth @ T_depth_thermal, (M, 4, 4).
 
-    camera : the refined one, in place of the scan's own. Raises ScanError if the scan has no thermal stream, or if not
+    camera : the refined one, in place of the scan's own. frame_dt_s : (F,) what times of single frames lack.
+    Raises ScanError if the scan has no thermal stream, or if not
     one thermal frame is left.
     """
     stream = scan.thermal
     if stream is None or len(stream) == 0:
         raise ScanError("the scan has no thermal frames", place=scan.root)
     camera = stream.camera if camera is None else camera
-    times_s = stream.times_s + camera.time_offset_s
+    times_s = stream.times_s + camera.time_offset_s + (0.0 if frame_dt_s is None else frame_dt_s)
     T_world_depth, valid = interpolate_trajectory(trajectory, times_s, max_gap_s=max_pose_gap_s)
     slack_s = 0.5 * float(np.median(np.diff(trajectory.times_s))) if len(trajectory) > 1 else 1e-3
     t = trajectory.times_s

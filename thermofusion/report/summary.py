@@ -197,6 +197,7 @@ def _rig(scan: Scan, a: RigResult) -> dict[str, Any]:
         "sigma_rotation_deg": a.sigma_rotation_deg,
         "sigma_translation_mm": a.sigma_translation_mm,
         "sigma_time_s": a.sigma_time_s,
+        "jitter_s": a.jitter_s,
         "views_used": a.views_used,
     }
 

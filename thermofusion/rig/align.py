@@ -36,10 +36,13 @@ from .estimate import (
     TRANSLATION,
     TWIST,
     OutlineSet,
+    Solved,
+    Stamps,
     State,
     prior_covariance,
     solve,
 )
+from .jitter import frame_times
 from .outlines import read_outlines, search_shift
 
 MAX_VIEWS = 30  # that enter: more cost time and say nothing new
@@ -47,6 +50,8 @@ MIN_VIEWS = 6
 HELD_SHARE = 0.7  # a sigma this near to its prior's is the prior's
 SUPPORT_CHI2 = 24.3  # 99.9 % of chi-square with 7 degrees of freedom: below it the data do not ask for a change
 ALIKE = 0.9  # correlation above which the clock cannot be told from a motion of the rig
+TIMES_ROUNDS = 2  # of solving for the rig, where the time of each view is unknown, too
+TOO_FEW = "too few points of the outline were found in the thermal images"
 CLOCK_UNSURE = 0.1  # of its prior's sigma: a clock known better is known, whatever it correlates with
 
 
@@ -58,6 +63,7 @@ class RigResult:
     covariance : (7, 7) of rotation vector [rad], translation [m] (left perturbation of T_thermal_depth) and time [s].
     outline_width_px : by how much the image's outline lies outside the model's (nuisance, not applied).
     changed : False = rig and clock are the scan's own. converged : the refinement came to rest.
+    frame_dt_s : (F,) what the times of single thermal frames lack, None = nothing; jitter_s : one sigma of it.
     """
 
     camera: ThermalCamera
@@ -69,6 +75,8 @@ class RigResult:
     converged: bool
     views_used: int
     messages: tuple[str, ...] = ()
+    frame_dt_s: Float | None = None
+    jitter_s: float = 0.0
 
     __repr__ = brief
 
@@ -130,7 +138,11 @@ def align(
     if contrast is None or len(outlines) < MIN_VIEWS:
         return _unchanged(camera, "the outline does not stand out from the background in the thermal images")
     times_s = stream.times_s[frames[[v.row for v in outlines]]]
-    result = _refined(OutlineSet(camera.lens, trajectory, outlines, times_s, contrast), begin)
+    measured = OutlineSet(camera.lens, trajectory, outlines, times_s, contrast)
+    result = _refined(measured, begin)
+    jitter = frame_times(measured, State.of(result.camera))
+    if jitter is not None:
+        result = _with_times(stream, mesh, measured, begin, input.max_pose_gap_ms / 1e3)
     if begin is camera:
         return result
     if not result.converged:
@@ -141,14 +153,59 @@ def align(
 
 def _frames(stream: ThermalStream, trajectory: Trajectory, max_gap_s: float) -> NDArray[np.intp]:
     """Thermal frames chosen evenly among those whose poses are known a little before and after, too."""
-    placed = stream.usable.copy()
-    for shift in (-2 * PRIOR_TIME_S, 0.0, 2 * PRIOR_TIME_S):
-        times = stream.times_s + stream.camera.time_offset_s + shift
-        placed &= interpolate_trajectory(trajectory, times, max_gap_s=max_gap_s)[1]
-    frames = np.flatnonzero(placed)
+    frames = np.flatnonzero(_placed(stream, trajectory, stream.camera.time_offset_s, 2 * PRIOR_TIME_S, max_gap_s))
     if len(frames) > MAX_VIEWS:
         frames = frames[np.round(np.linspace(0, len(frames) - 1, MAX_VIEWS)).astype(int)]
     return frames
+
+
+def _placed(
+    stream: ThermalStream, trajectory: Trajectory, offset_s: float, around_s: float, max_gap_s: float
+) -> NDArray[np.bool_]:
+    """(F,) usable thermal frames whose poses are known, and those of times around_s before and after."""
+    placed = stream.usable.copy()
+    for shift in (-around_s, 0.0, around_s):
+        placed &= interpolate_trajectory(trajectory, stream.times_s + offset_s + shift, max_gap_s=max_gap_s)[1]
+    return placed
+
+
+def _with_times(
+    stream: ThermalStream, mesh: SurfaceMesh, chosen: OutlineSet, begin: ThermalCamera, max_gap_s: float
+) -> RigResult:
+    """The rig again, with the time of each view unknown, and then the times of all frames.
+
+    chosen : the views that enter, at their stamps, which jitter.
+    """
+    start = state = State.of(begin)
+    times = at_start = frame_times(chosen, start, sure=True)
+    solved = None
+    for _ in range(TIMES_ROUNDS):
+        assert times is not None
+        solved = solve(chosen.later(times.dt_s), start, Stamps(times.dt_s, times.scatter_s))
+        if solved is None:
+            return _unchanged(begin, TOO_FEW)
+        state = solved.state
+        times = frame_times(chosen, state, sure=True)
+    assert times is not None
+    assert at_start is not None
+    assert solved is not None
+    before = chosen.later(at_start.dt_s).residual_px(start)
+    result = _decided(chosen, begin, solved, before, chosen.later(times.dt_s).residual_px(state))
+    state = State.of(result.camera)
+    frames = np.flatnonzero(_placed(stream, chosen.trajectory, state.time_offset_s, 0.0, max_gap_s))
+    T_world_depth, _ = interpolate_trajectory(chosen.trajectory, stream.times_s[frames] + state.time_offset_s)
+    views, _ = read_outlines(stream, mesh, frames.tolist(), T_world_depth @ invert(state.T_thermal_depth))
+    seen = frames[[v.row for v in views]]
+    times = frame_times(replace(chosen, views=views, times_s=stream.times_s[seen]), state, sure=True)
+    assert times is not None
+    dt_s = np.zeros(len(stream))
+    dt_s[seen] = times.dt_s
+    text = (
+        f"time stamps of single thermal frames jitter by {1e3 * times.scatter_s:.0f} ms: the outlines of "
+        f"{len(seen)} say when they were taken, and left-out outline comes from {times.before_px:.2f} to "
+        f"{times.after_px:.2f} px"
+    )
+    return replace(result, frame_dt_s=dt_s, jitter_s=times.scatter_s, messages=(*result.messages, text))
 
 
 def _refined(outlines: OutlineSet, camera: ThermalCamera) -> RigResult:
@@ -157,9 +214,14 @@ def _refined(outlines: OutlineSet, camera: ThermalCamera) -> RigResult:
     before = outlines.residual_px(start)
     solved = solve(outlines, start)
     if solved is None:
-        return _unchanged(camera, "too few points of the outline were found in the thermal images", before)
-    after, state = outlines.residual_px(solved.state), solved.state
-    change = state.distance(start)[RIG]
+        return _unchanged(camera, TOO_FEW, before)
+    return _decided(outlines, camera, solved, before, outlines.residual_px(solved.state))
+
+
+def _decided(outlines: OutlineSet, camera: ThermalCamera, solved: Solved, before: float, after: float) -> RigResult:
+    """What was solved for, or the camera as it is; before, after : distance between outlines, px."""
+    state = solved.state
+    change = state.distance(State.of(camera))[RIG]
     cov = solved.covariance[RIG, RIG] + outlines.shared_error()
     supported = float(change @ np.linalg.solve(cov, change)) > SUPPORT_CHI2 and after < before
     found = _described(change)

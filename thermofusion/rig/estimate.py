@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,13 +57,15 @@ class State:
 class Measured:
     """Residuals of all views' outline points, (n,) px, their derivatives (n, 8) by the unknowns, and what points share.
 
-    view : (n,) their views. block : (n,) the cell of the body they lie in.
+    view : (n,) their views. block : (n,) the cell of the body they lie in. point : (n,) which they are of all contour
+    points of all views, one view after the other.
     """
 
     residual_px: Float
     jacobian: Float
     view: NDArray[np.intp]
     block: NDArray[np.intp]
+    point: NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,15 +81,25 @@ class OutlineSet:
     def measure(self, state: State, reach: float) -> Measured:
         """Distances between model's and image's outline, edges looked for within `reach` px."""
         T_thermal_world, velocity = self._poses(state)
-        residual, jacobian, cell = [], [], []
+        residual, jacobian, cell, point, first = [], [], [], [], 0
         for view, T, twist in zip(self.views, T_thermal_world, velocity, strict=True):
             m = measure_outline(self.lens, view, T, reach, self.contrast)
             residual.append(m.residual_px - state.width_px)
             jacobian.append(np.column_stack([m.motion, m.motion @ twist, np.ones(len(m.motion))]))
             cell.append(np.floor(view.contour.point_m[m.point] / BLOCK_M).astype(np.int64))
+            point.append(first + m.point)
+            first += len(view.contour)
         index = np.repeat(np.arange(len(residual)), [len(r) for r in residual])
         block = np.unique(np.concatenate(cell) @ [1_000_003, 1_009, 1], return_inverse=True)[1]
-        return Measured(np.concatenate(residual), np.concatenate(jacobian), index, block)
+        return Measured(np.concatenate(residual), np.concatenate(jacobian), index, block, np.concatenate(point))
+
+    def later(self, dt_s: Float) -> OutlineSet:
+        """With views taken later than stamped, dt_s (N,)."""
+        return replace(self, times_s=self.times_s + dt_s)
+
+    def twists(self, state: State) -> Float:
+        """(N, 6) the world's twist in the thermal frame per second: rad/s, m/s."""
+        return self._poses(state)[1]
 
     def residual_px(self, state: State) -> float:
         """Robust RMS residual over a fixed, wide reach, so that before and after compare; median (width) removed."""
@@ -109,6 +121,26 @@ class OutlineSet:
 
 
 @dataclass(frozen=True, eq=False)
+class Stamps:
+    """Times of views that jitter by sigma_s about their stamps: dt_s (N,) is what has been added to them already."""
+
+    dt_s: Float
+    sigma_s: float
+
+    def free(self, m: Measured, weight: Float) -> tuple[Float, Float]:
+        """What each view's own time takes of information (8, 8) and gradient (8,), of points' weights, px-2.
+
+        Schur's complement of one unknown a view, whose prior is N(-dt, sigma²).
+        """
+        n, lever = len(self.dt_s), m.jacobian[:, CLOCK]
+        shared = np.zeros((n, PARAMETERS))
+        np.add.at(shared, m.view, (weight * lever)[:, None] * m.jacobian)
+        own = np.bincount(m.view, weight * lever**2, n) + self.sigma_s**-2
+        pull = np.bincount(m.view, weight * lever * m.residual_px, n) - self.dt_s * self.sigma_s**-2
+        return shared.T @ (shared / own[:, None]), shared.T @ (pull / own)
+
+
+@dataclass(frozen=True, eq=False)
 class Solved:
     """The estimate, its covariance (8, 8), and the largest step of the last iteration, in sigmas."""
 
@@ -127,10 +159,10 @@ def prior_covariance() -> Float:
     return np.diag([np.radians(PRIOR_ROTATION_DEG) ** 2] * 3 + [PRIOR_TRANSLATION_M**2] * 3 + [PRIOR_TIME_S**2])
 
 
-def solve(outlines: OutlineSet, start: State) -> Solved | None:
+def solve(outlines: OutlineSet, start: State, stamps: Stamps | None = None) -> Solved | None:
     """Robust Gauss-Newton with the calibrated rig as prior, the reach of the search shrinking.
 
-    None where too few points of the outline are found.
+    stamps : where each view's time is unknown, too. None where too few points of the outline are found.
     """
     prior = np.diag(1 / np.append(np.diag(prior_covariance()), PRIOR_WIDTH_PX**2))
     state, solved = start, None
@@ -143,6 +175,9 @@ def solve(outlines: OutlineSet, start: State) -> Solved | None:
         gradient = m.jacobian.T @ (weight * m.residual_px) / scale**2
         deflate = _design_effect(m, weight / scale**2, information)
         information, gradient = information / deflate, gradient / deflate
+        if stamps is not None:
+            taken = stamps.free(m, weight / scale**2 / deflate)
+            information, gradient = information - taken[0], gradient - taken[1]
         step = np.linalg.solve(information + prior, gradient - prior @ state.distance(start))
         state = state.moved(np.asarray(step, np.float64))
         cov = np.asarray(np.linalg.inv(information + prior), np.float64)
