@@ -215,7 +215,7 @@ def test_writers_refuse_broken_meshes(tmp_path):
 
 def test_files_are_whole_or_absent(tmp_path):
     path = tmp_path / "a"
-    write_whole(path, [b"first"])
+    write_whole(path, [b"first thermofusion"])
 
     def torn():
         yield b"second, torn"
@@ -223,7 +223,7 @@ def test_files_are_whole_or_absent(tmp_path):
 
     with pytest.raises(ResourceError, match="No space left"):
         write_whole(path, torn())
-    assert path.read_bytes() == b"first"
+    assert path.read_bytes() == b"first thermofusion"
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
     with pytest.raises(ResourceError):
         write_ply(tmp_path / "absent" / "m.ply", result())

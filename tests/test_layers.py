@@ -24,7 +24,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "types": (),
     "progress": (),
     "robust": ("types", "errors"),
-    "files": ("types", "errors"),
+    "files": ("types", "errors", "version"),
     "recipe": ("errors", "files"),
     "geometry": ("types", "errors", "robust"),
     "physics": ("types", "errors", "recipe"),

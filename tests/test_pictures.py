@@ -26,6 +26,7 @@ from thermofusion.report.pictures import (
     write_views,
 )
 from thermofusion.types import ThermalMesh
+from thermofusion.version import __version__
 
 INFERNO = ColorScale("inferno", 27.0, 33.0, "°C", "")
 
@@ -347,6 +348,7 @@ def test_a_picture_keeps_its_texts_for_other_readers(tmp_path):
     image = np.zeros((3, 4, 3), np.uint8)
     path = write_png(tmp_path / "a.png", image, {"Scan": "Müller 71 µ", "Run": "ab12"})
     with Image.open(path) as picture:
-        assert picture.text == {"Scan": "Müller 71 µ", "Run": "ab12"}  # type: ignore[attr-defined]
+        told = {"Software": f"thermofusion {__version__}", "Scan": "Müller 71 µ", "Run": "ab12"}
+        assert picture.text == told  # type: ignore[attr-defined]
         assert picture.size == (4, 3)
     assert np.array_equal(cv2.imread(str(path)), image)

@@ -142,11 +142,11 @@ def test_every_stored_noun_has_one_name_and_old_names_lead_to_one():
 
 def test_files_appear_whole_or_not_at_all(tmp_path):
     path = tmp_path / "x" / "out.txt"
-    write_text(path, "old")
+    write_text(path, "old thermofusion")
     with pytest.raises(RuntimeError), replacing(path) as temporary:  # noqa: PT012
         temporary.write_text("half")
         raise RuntimeError
-    assert path.read_text() == "old"
+    assert path.read_text() == "old thermofusion"
     assert [p.name for p in path.parent.iterdir()] == ["out.txt"]
     with pytest.raises(ResourceError, match="cannot be written"), replacing(path):
         raise OSError(28, "No space left on device")

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from ..errors import RecipeError, counted
-from .console import emit, progress
+from .console import emit, progress, spared_file
 from .options import spelled_out
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
@@ -37,7 +37,9 @@ class Besides:
 @spelled_out
 def calibrate(
     folder: Annotated[Path, typer.Argument(help="Pictures of the board and a calibration.json (docs/calibration.md).")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Rig file to write.")] = Path("rig.json"),
+    out: Annotated[Path, typer.Option("-o", "--out", help="Rig file to write.", callback=spared_file)] = Path(
+        "rig.json"
+    ),
     picks: Annotated[Path | None, typer.Option(help="Points picked by hand: CSV or picks.mat.")] = None,
     report: Annotated[Path | None, typer.Option(help="Report to write; beside the rig by default.")] = None,
     *,
@@ -84,7 +86,9 @@ def _day(text: str | None) -> str | None:
 
 
 def board(
-    out: Annotated[Path, typer.Option("-o", "--out", help="File to write: .svg or .pdf.")] = Path("board.pdf"),
+    out: Annotated[Path, typer.Option("-o", "--out", help="File to write: .svg or .pdf.", callback=spared_file)] = Path(
+        "board.pdf"
+    ),
     kind: Annotated[
         str, typer.Option(help="checkerboard, pins, mask, circles, asymmetric-circles, charuco, lamps.")
     ] = "checkerboard",

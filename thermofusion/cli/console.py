@@ -72,10 +72,23 @@ def note(text: str) -> None:
             say(visible(text), sys.stderr)
 
 
-def named(out: Path) -> Path:
-    """A folder or file given with -o. Raises RecipeError for an empty name."""
+def named(out: Path | None) -> Path | None:
+    """What was given with -o. Raises RecipeError for an empty name, and for a place in a recording."""
+    from ..scans.apart import apart
+
+    if out is None:
+        return None
     if not str(out).strip() or out == Path():
         raise RecipeError("-o needs a name, got an empty one", hint="name a new folder")
+    return apart(out)
+
+
+def spared_file(out: Path | None) -> Path | None:
+    """A file given with -o: as `named`, and before the work ScanError where a file of another origin stands there."""
+    from ..files.whole import spared
+
+    if named(out) is not None and out is not None:
+        spared(out)
     return out
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from ..files.json import to_json
-from .console import emit, help_alone, note
+from .console import emit, help_alone, named, note
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 recipes = typer.Typer(
@@ -71,7 +71,9 @@ def devices(json: Json = False) -> None:
 def check(
     scan: Annotated[Path, typer.Argument(help="A scan folder, or a foreign recording.")],
     format: Annotated[str | None, typer.Option(help="Format of the recording; recognised by default.")] = None,
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder for overlay pictures.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Folder for overlay pictures.", callback=named)
+    ] = None,
     rig: Annotated[Path | None, typer.Option(help="Overlay this rig.json instead of the scan's own.")] = None,
     template: Annotated[
         bool, typer.Option("--template", help="Print a metadata.json to fill in and to put beside the recording.")

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from .console import emit, note, progress
+from .console import emit, named, note, progress
 from .options import Json, Processing, Recording, spelled_out
 
 
@@ -21,7 +21,8 @@ def validate(
     recording: Recording,
     processing: Processing,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Result folder: what it holds is reused, the rest written.")
+        Path | None,
+        typer.Option("-o", "--out", help="Result folder: what it holds is reused, the rest written.", callback=named),
     ] = None,
     folds: Annotated[int, typer.Option(min=2, help="Parts the views are cut into, each left out once.")] = 5,
     motion: Annotated[bool, typer.Option(help="Also try small corrections of single views.")] = True,
@@ -42,7 +43,9 @@ def compare(
         Path,
         typer.Argument(help="The same; or a truth (.npz, or a simulated scan); or contact readings (.csv, .json)."),
     ],
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder for report, plot and difference map.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Folder for report, plot and difference map.", callback=named)
+    ] = None,
     mirror: Annotated[bool, typer.Option("--mirror", help="Mirror the second, left for right, first.")] = False,
     registered: Annotated[bool, typer.Option("--register/--no-register", help="Lay one surface on the other.")] = True,
     max_distance_mm: Annotated[float, typer.Option(min=0.1, help="Between partners on the two surfaces.")] = 10.0,

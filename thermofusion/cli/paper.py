@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from ..errors import QualityError
-from .console import emit, note, progress
+from .console import emit, named, note, progress
 
 
 def register(app: typer.Typer) -> None:
@@ -20,7 +20,9 @@ def paper(
     data: Annotated[
         Path | None, typer.Option("--data", help="Folder with the recordings: jhu/, tables/, torso-dev/.")
     ] = None,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Where the figures go.")] = Path("paper-figures"),
+    out: Annotated[Path, typer.Option("-o", "--out", help="Where the figures go.", callback=named)] = Path(
+        "paper-figures"
+    ),
     only: Annotated[str | None, typer.Option("--only", help="Comma-separated: table1, fig7 … fig16, or steps.")] = None,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> int:

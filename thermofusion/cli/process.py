@@ -25,7 +25,7 @@ def register(app: typer.Typer) -> None:
 def run(
     recording: Recording,
     processing: Processing,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Result folder.")] = Path("out"),
+    out: Annotated[Path, typer.Option("-o", "--out", help="Result folder.", callback=named)] = Path("out"),
     from_: Annotated[str | None, typer.Option("--from", help=f"Compute anew from this stage: {STAGES}.")] = None,
     until: Annotated[str | None, typer.Option("--until", help=f"Stop after this stage: {STAGES}.")] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be computed, and why.")] = False,
@@ -42,9 +42,7 @@ def run(
         emit(plans, "\n".join(f"{p.name:<12} {'reuse' if p.reuse else 'compute'}  ({p.why})" for p in plans), json)
         return 0
     with progress(json) as step:
-        result = pipeline.fuse(
-            scan, chosen, out=named(out), progress=step, redo_from=from_, until=until, overwrite=overwrite
-        )
+        result = pipeline.fuse(scan, chosen, out=out, progress=step, redo_from=from_, until=until, overwrite=overwrite)
     emit(result.report, pipeline.summary(result.report, out), json)
     for line in renamed:
         note(line)
@@ -52,7 +50,7 @@ def run(
 
 
 def demo(
-    out: Annotated[Path, typer.Option("-o", "--out", help="Result folder.")] = Path("demo-result"),
+    out: Annotated[Path, typer.Option("-o", "--out", help="Result folder.", callback=named)] = Path("demo-result"),
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> int:
@@ -64,7 +62,7 @@ def demo(
 
     scan = open_scan(data_dir() / "demo")
     with progress(json) as step:
-        result = pipeline.fuse(scan, load_recipe("torso"), out=named(out), progress=step, overwrite=overwrite)
+        result = pipeline.fuse(scan, load_recipe("torso"), out=out, progress=step, overwrite=overwrite)
     emit(result.report, pipeline.summary(result.report, out), json)
     note(f"open the report in a browser, {out / 'mesh.glb'} in Blender, {out / 'mesh.ply'} in MeshLab")
     return QualityError.exit_code if result.report["quality"]["failed"] else 0
@@ -77,7 +75,9 @@ def export(
         str, typer.Option("--format", help="Comma-separated: ply, glb, vtp, csv, obj, stl, vtk-mesh, dicom.")
     ] = "ply,glb,vtp",
     show: Annotated[str, typer.Option(help="absolute, normal-equivalent or apparent.")] = "absolute",
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder; the result's own by default.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Folder; the result's own by default.", callback=named)
+    ] = None,
     *,
     filed: Filed,
     json: Json = False,
@@ -91,7 +91,7 @@ def export(
     palette, limits = drawing.palette, drawing.range_degC
     if filed.deidentify and out is None:
         raise RecipeError("--deidentify needs -o: a folder of its own, apart from the files that tell who it is")
-    folder = result if out is None else named(out)
+    folder = result if out is None else out
     wanted = [f.strip() for f in formats.split(",")]
     dicom = "dicom" in wanted
     reported = filed.reported(result) if dicom or filed.deidentify else None

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from .console import emit, note
+from .console import emit, named, note, spared_file
 from .options import Filed, Json, spelled_out
 
 Folder = Annotated[Path, typer.Argument(help="A result folder.")]
@@ -23,7 +23,10 @@ def register(app: typer.Typer) -> None:
 def report(
     result: Folder,
     filed: Filed,
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="File; report.html in the result by default.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("-o", "--out", help="File; report.html in the result by default.", callback=spared_file),
+    ] = None,
     json: Json = False,
 ) -> None:
     """Write a result's report: one HTML file to look at, to measure in, and to file."""
@@ -52,7 +55,9 @@ def view(result: Folder, json: Json = False) -> None:
 def measure(
     result: Folder,
     regions: Annotated[Path, typer.Option("--regions", help="Regions JSON, as the report saves it.")],
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="Stem of the files; regions in the result.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Stem of the files; regions in the result.", callback=named)
+    ] = None,
     json: Json = False,
 ) -> None:
     """What regions of interest read: mean, its uncertainty, area, left against right; as CSV and JSON."""

@@ -12,7 +12,7 @@ import typer
 
 from ..errors import RecipeError, ScanError, counted
 from ..progress import Progress
-from .console import emit, help_alone, low_high, note, progress
+from .console import emit, help_alone, low_high, note, progress, spared_file
 from .options import spelled_out
 
 if TYPE_CHECKING:
@@ -69,7 +69,9 @@ class CurveModel:
 @spelled_out
 def curve(
     readings: Readings,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Curve file to write.")] = Path("curve.json"),
+    out: Annotated[Path, typer.Option("-o", "--out", help="Curve file to write.", callback=spared_file)] = Path(
+        "curve.json"
+    ),
     *,
     chosen: CurveModel,
     raw: Raw = None,
@@ -104,7 +106,9 @@ def curve(
 @verbs.command()
 def field(
     readings: Readings,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Field file to write.")] = Path("field.npz"),
+    out: Annotated[Path, typer.Option("-o", "--out", help="Field file to write.", callback=spared_file)] = Path(
+        "field.npz"
+    ),
     curve: Curve = None,
     degree: Annotated[int, typer.Option(min=0, max=4, help="Power of temperature each pixel's error follows.")] = 1,
     raw: Raw = None,
@@ -163,7 +167,9 @@ def flatten(
 @verbs.command()
 def noise(
     source: Source,
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="Allan-type plot to write: .svg.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Allan-type plot to write: .svg.", callback=spared_file)
+    ] = None,
     curve: Curve = None,
     rate: Annotated[float | None, typer.Option(min=1e-3, help="Frames a second, where they state no times.")] = None,
     raw: Raw = None,

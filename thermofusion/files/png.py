@@ -10,12 +10,17 @@ from types import MappingProxyType
 import cv2
 
 from ..types import UInt8
+from ..version import __version__
 
 HEAD = 33  # bytes of the signature and IHDR, behind which texts may stand
 
 
 def encode_png(image: UInt8, texts: Mapping[str, str] = MappingProxyType({}), *, small: bool = False) -> bytes:
-    """A picture (H, W, 3) sRGB or grey (H, W). texts : by keyword (iTXt, 11.3.4). small : at the cost of time."""
+    """A picture (H, W, 3) sRGB or grey (H, W), which names this program. texts : by keyword (iTXt, 11.3.4).
+
+    small : at the cost of time.
+    """
+    texts = {"Software": f"thermofusion {__version__}", **texts}
     options = [cv2.IMWRITE_PNG_COMPRESSION, 9] if small else []
     _, data = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image, options)
     png = data.tobytes()

@@ -13,20 +13,27 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ResourceError
+from ..errors import ResourceError, ScanError
 
 # Names of temporary files, should a run be killed: `.NAME.PROCESS.RANDOM.part`, and the name's suffix again.
 LEFTOVER = re.compile(r"\..*\.\d+\.[0-9a-f]{8}\.part(\.\w+)?")
+# What every file of this program says of itself within its first bytes; tables, which have no room for it, begin so.
+MARK, TABLES, MARKED_BYTES = b"thermofusion", (b"x_m,y_m,z_m,nx,", b"name,kind,value_degC,"), 1 << 16
+# Files of this program's form that are a person's own work.
+PERSONAL = (b"thermofusion-scan/", b"thermofusion-regions/", b"thermofusion-metadata/")
 
 
 @contextmanager
-def replacing(path: str | Path) -> Iterator[Path]:
+def replacing(path: str | Path, *, whatever: bool = False) -> Iterator[Path]:
     """A temporary path in the same folder that becomes `path` when the block ends well, and vanishes otherwise.
 
-    The file reaches the disk before its name does; its permissions are what the user's umask leaves. Raises
-    ResourceError where the folder or the disk refuses.
+    The file reaches the disk before its name does; its permissions are what the user's umask leaves. whatever : replace
+    even what this program did not write. Raises ScanError for such a file, ResourceError where the folder or the disk
+    refuses.
     """
     path = Path(path)
+    if not whatever:
+        spared(path)
     with _refusals(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = _temporary(path)
@@ -38,6 +45,23 @@ def replacing(path: str | Path) -> Iterator[Path]:
             _to_disk(path.parent)
         finally:
             temporary.unlink(missing_ok=True)
+
+
+def spared(path: Path) -> None:
+    """Raises ScanError where a file stands that this program did not write, or that is a person's own work."""
+    try:
+        if not path.is_file():
+            return
+        with path.open("rb") as f:
+            head = f.read(MARKED_BYTES)
+    except OSError:
+        return  # whoever writes will say what is the matter
+    ours = (MARK in head and not any(kind in head for kind in PERSONAL)) or head.startswith(TABLES)
+    if head and not ours:
+        hint = "name another one, or remove this one first"
+        raise ScanError(
+            "a file that thermofusion did not write stands here, and would be replaced", place=path, hint=hint
+        )
 
 
 def write_whole(path: str | Path, chunks: Iterable[bytes | NDArray]) -> Path:
@@ -57,9 +81,9 @@ def write_whole(path: str | Path, chunks: Iterable[bytes | NDArray]) -> Path:
     return Path(path)
 
 
-def write_text(path: str | Path, text: str) -> Path:
-    """Write a text file in UTF-8, its folder made; returns the path. Raises ResourceError."""
-    with replacing(path) as temporary:
+def write_text(path: str | Path, text: str, *, whatever: bool = False) -> Path:
+    """Write a text file in UTF-8, its folder made; returns the path. whatever : as `replacing`. Raises as it does."""
+    with replacing(path, whatever=whatever) as temporary:
         temporary.write_bytes(text.encode())
     return Path(path)
 

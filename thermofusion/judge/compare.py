@@ -24,6 +24,7 @@ from ..geometry.rays import RayScene
 from ..robust import NORMAL_95, weighted_quantile
 from ..temperature.references import CONTACT_FAR_M, under_sensor
 from ..types import Float, Float32, ThermalMesh
+from ..version import __version__
 from .contacts import SkinReading, read_contacts
 from .register import Registration, as_they_are, mirrored, register
 
@@ -110,6 +111,7 @@ class Comparison:
             for name, a, b in zip(self.places, self.first_degC, self.second_degC, strict=False)
         ]
         return {
+            "software": f"thermofusion {__version__}",
             "kind": self.kind,
             "agreement": self.agreement,
             "compared_fraction": self.compared,

@@ -16,13 +16,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import RecipeError, ScanError
-from ..files.json import to_json
+from ..files.json import plain, to_json
 from ..files.whole import write_text
 from ..progress import Progress, silent
 from ..recipe import Recipe
 from ..robust import Statistics, mad_sigma
 from ..temperature.uncertainty import BILINEAR_VARIANCE
 from ..types import Scan
+from ..version import __version__
 from .leftout import WELL_SEEN_DEG, Bench, LeftOut
 from .maperror import MapError, map_error
 
@@ -134,7 +135,7 @@ def validate(
         scan, recipe, fuse(scan, recipe, out=out, progress=step), folds=folds, motion=motion, progress=step
     )
     if out is not None:
-        write_text(Path(out) / "validation.json", to_json(report))
+        write_text(Path(out) / "validation.json", to_json({"software": f"thermofusion {__version__}", **plain(report)}))
     return report
 
 

@@ -15,12 +15,14 @@ from typing import Any
 import numpy as np
 
 from ..types import Bool, Float, SharedErrors, ThermalMesh, VertexFlag
+from ..version import __version__
 from .body import Body, along
 from .errors import MeanErrors, VertexErrors
 from .patch import Patch, patch_of
 from .region import Line, Region, Slab, Spot, opposite
 from .volume import slab_volume, swelling_volume
 
+MEASURED = "thermofusion-measured/1"
 NAN = float("nan")
 PROFILE_STEP_M = 2e-3  # about a vertex
 
@@ -101,7 +103,8 @@ class Measured:
             {**r.row(), "budget_K": {} if r.errors is None else r.errors.budget_K, "profile": r.profile}
             for r in self.readings
         ]
-        return {"regions": readings, "differences": [vars(d) for d in self.differences]}
+        told = {"schema": MEASURED, "software": f"thermofusion {__version__}"}
+        return {**told, "regions": readings, "differences": [vars(d) for d in self.differences]}
 
     def csv(self) -> str:
         """One line a region, then one a difference; an empty cell is not measured or does not apply."""

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..export import palettes
 from ..files.png import encode_png
 from ..types import Float, UInt8
+from ..version import __version__
 
 BLUE, ORANGE, GREEN, PURPLE, SKY, AMBER, INK, GREY = (
     "#0072b2",
@@ -302,6 +303,7 @@ def page(
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" height="{height:.0f}"'
         f' viewBox="0 0 {width:.0f} {height:.0f}" {_FONT}>',
+        f"<metadata>thermofusion {__version__}</metadata>",
         f'<rect width="{width:.0f}" height="{height:.0f}" fill="#ffffff"/>',
     ]
     if title:

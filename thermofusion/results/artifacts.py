@@ -33,7 +33,7 @@ def save_artifact(path: Path, value: object, note: Mapping[str, Any] | None = No
     tree = json.dumps(_pack(value, arrays))
     texts = {TREE: tree, NOTE: json.dumps(dict(note or {}))}
     members = {k: np.frombuffer(v.encode(), np.uint8) for k, v in texts.items()}
-    with replacing(path) as temporary, temporary.open("wb") as f:
+    with replacing(path, whatever=True) as temporary, temporary.open("wb") as f:
         np.savez(f, allow_pickle=False, **members, **arrays)
 
 

@@ -100,12 +100,12 @@ def _own(folder: Path, scan: Scan, names: list[str], left: list[str]) -> None:
     report = _report(folder)
     there = [p for p in folder.iterdir() if p.name not in (LOCK, WORK) and not LEFTOVER.fullmatch(p.name)]
     ours = bool(report) or (folder / WORK).is_dir()
-    foreign = next((p for p in there if not ours), None)
+    foreign = next((p for p in there if not ours and not p.is_dir()), None)
     foreign = foreign or next((folder / n for n in names if n not in left and (folder / n).is_file()), None)
     hint = "name another folder with -o, or give --overwrite"
-    if foreign is not None and report is not None and not foreign.is_dir():
+    if foreign is not None and report is not None:
         raise ScanError("this file is not of the result here, and would be replaced", place=foreign, hint=hint)
-    if foreign is not None and not foreign.is_dir():
+    if foreign is not None:
         raise ScanError("the folder holds something that is no result", place=foreign, hint=hint)
     known = (report or {}).get("scan", {})
     name, ident = known.get("name"), known.get("id")

@@ -145,7 +145,7 @@ def write_result(
                 write_report(new / PAGE, reported, read_image(overview)[..., ::-1] if overview.is_file() else None)
         files = sorted(p.relative_to(new).as_posix() for p in new.rglob("*") if p.is_file())
         write_text(new / REPORT, to_json({**result.report, "files": [*files, REPORT]}))
-        write_text(folder / CHANGING, to_json(sorted({*left, *files, REPORT})))
+        write_text(folder / CHANGING, to_json(sorted({*left, *files, REPORT})), whatever=True)
     superseded = [] if last is None or result.temperature is None else [last[0]]
     for name in {*left, *superseded, CHANGING} - {*files, REPORT}:
         (folder / name).unlink(missing_ok=True)

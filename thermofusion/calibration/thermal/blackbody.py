@@ -19,6 +19,7 @@ from ...files.table import table_rows
 from ...files.whole import replacing, write_text
 from ...scans.native.schema import Constant, SignalDoc
 from ...types import Float, SignalCurve
+from ...version import __version__
 from .radiometric import PixelField, RadiometricCurve, check_monotone
 from .source import ThermalSource
 
@@ -159,7 +160,7 @@ def read_curve(path: Path) -> RadiometricCurve:
 def write_field(path: Path, field: PixelField) -> None:
     """Write a pixel field as .npz (`z`: (P, H, W) float32), whole or not at all."""
     with replacing(path) as temporary, temporary.open("wb") as f:
-        np.savez_compressed(f, z=field.z)
+        np.savez_compressed(f, thermofusion=np.array(__version__), z=field.z)
 
 
 def read_field(path: Path) -> PixelField:
