@@ -33,7 +33,8 @@ def folder(tmp_path):
     """A result's folder of a tall egg, with secrets wherever a result holds text."""
     name, number, day, clock, serial, place, operator = SECRETS
     mesh = result(sphere(60, 90, (0.12, 0.1, 0.3)), unmeasured_below_m=-0.27)
-    mesh = type(mesh)(**{**vars(mesh), "metadata": {"up": "0 0 1", "front": "0 -1 0", "scan": name}})
+    told = {"metadata": {"up": "0 0 1", "front": "0 -1 0", "scan": name}, "residual": mesh.uncertainty_K}
+    mesh = type(mesh)(**{**vars(mesh), **told})
     T = mesh.temperature_degC
     out = tmp_path / "result"
     save_artifact(out / "result.npz", Temperature(mesh, T, T, mesh.apparent_degC, messages=(place,)))

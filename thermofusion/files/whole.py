@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import shutil
@@ -19,6 +20,7 @@ from ..errors import ResourceError, ScanError
 LEFTOVER = re.compile(r"\..*\.\d+\.[0-9a-f]{8}\.part(\.\w+)?")
 # What every file of this program says of itself within its first bytes; tables, which have no room for it, begin so.
 MARK, TABLES, MARKED_BYTES = b"thermofusion", (b"x_m,y_m,z_m,nx,", b"name,kind,value_degC,"), 1 << 16
+FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))  # Windows knows no quota
 # Files of this program's form that are a person's own work.
 PERSONAL = (b"thermofusion-scan/", b"thermofusion-regions/", b"thermofusion-metadata/")
 
@@ -32,6 +34,8 @@ def replacing(path: str | Path, *, whatever: bool = False) -> Iterator[Path]:
     refuses.
     """
     path = Path(path)
+    if path.is_dir():
+        raise ResourceError("a folder stands where a file is to be written", place=path, hint="name a file")
     if not whatever:
         spared(path)
     with _refusals(path):
@@ -147,7 +151,8 @@ def _refusals(path: Path) -> Iterator[None]:
         yield
     except OSError as e:
         place = path if e.filename is None or Path(e.filename).name.startswith(".") else e.filename
-        raise ResourceError(f"it cannot be written ({e.strerror})", place=place, hint="free some space") from None
+        hint = "free some space" if e.errno in FULL else None
+        raise ResourceError(f"it cannot be written ({e.strerror})", place=place, hint=hint) from None
 
 
 def _temporary(path: Path) -> Path:

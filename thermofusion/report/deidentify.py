@@ -8,7 +8,7 @@ dates, times of day, serial numbers, places of files and free text go.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from ..export.columns import vertex_normals
 from ..files.json import plain
 from ..regions import Brush, Measured, Measurer
 from ..temperature.solve import Temperature
-from ..types import Float, SharedErrors, SurfaceMesh, ThermalMesh
+from ..types import Bool, Float, SharedErrors, SurfaceMesh, ThermalMesh
 from .html import Reported
 from .metadata import ITEMS
 
@@ -105,21 +105,27 @@ def _coarsened(temperature: Temperature) -> Temperature:
     return _cut(temperature, keep, SurfaceMesh(vertices, triangles, vertex_normals(vertices, triangles)))
 
 
-def _cut(temperature: Temperature, keep: np.ndarray, surface: SurfaceMesh) -> Temperature:
+def _cut(temperature: Temperature, keep: Bool, surface: SurfaceMesh) -> Temperature:
     """The temperatures of the vertices that are kept (V,), on their new surface."""
     mesh, shared = temperature.mesh, temperature.shared
-    columns = ("temperature_degC", "apparent_degC", "uncertainty_K", "view_angle_deg", "distance_m", "observations")
-    cut = {k: getattr(mesh, k)[keep] for k in (*columns, "flags")}
-    parts = {k: v[keep] for k, v in mesh.uncertainty_parts.items()}
     return replace(
         temperature,
-        mesh=replace(mesh, surface=surface, uncertainty_parts=parts, **cut),
-        absolute_degC=temperature.absolute_degC[keep],
-        normal_equivalent_degC=temperature.normal_equivalent_degC[keep],
-        apparent_degC=temperature.apparent_degC[keep],
-        body_fraction=None if temperature.body_fraction is None else temperature.body_fraction[keep],
+        **_columns(temperature, keep),
+        mesh=replace(mesh, surface=surface, **_columns(mesh, keep)),
         shared=None if shared is None else replace(shared, effect=shared.effect[keep]),
     )
+
+
+def _columns(noun: Temperature | ThermalMesh, keep: Bool) -> dict[str, Any]:
+    """The fields of a noun that hold a number a vertex, alone or by name: what they hold of the kept ones."""
+    found: dict[str, Any] = {}
+    for field in fields(noun):
+        value = getattr(noun, field.name)
+        if isinstance(value, np.ndarray) and value.shape[:1] == keep.shape:
+            found[field.name] = value[keep]
+        elif isinstance(value, dict) and any(isinstance(v, np.ndarray) for v in value.values()):
+            found[field.name] = {k: v[keep] if np.shape(v)[:1] == keep.shape else v for k, v in value.items()}
+    return found
 
 
 def _without_identity(report: Mapping[str, Any]) -> dict[str, Any]:
