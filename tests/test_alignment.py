@@ -107,6 +107,18 @@ def test_right_rig_is_left_alone(body, scan):
     assert result.residual_px_before == pytest.approx(result.residual_px_after)
     assert result.residual_px_before < 0.3
     assert result.frame_dt_s is None
+    assert result.depth_scale == 0
+
+
+def test_a_wrong_scale_of_depth_is_told_from_a_turned_rig(body, scan):
+    """Depth, and poses tracked with it, 8 % too large: what this coarse camera sees of the cameras' spacing."""
+    large = SurfaceMesh(1.08 * body.vertices_m, body.triangles, body.normals)
+    path = walk()
+    poses = path.T_world_depth.copy()
+    poses[:, :3, 3] *= 1.08
+    result = aligned(scan, large, Trajectory(path.times_s, poses))
+    assert result.depth_scale == pytest.approx(0.08, rel=0.25)
+    assert aligned(turned(scan, [0.3, -0.3, 0.26]), body, walk()).depth_scale == 0
 
 
 @pytest.mark.parametrize(("rotation_deg", "left_s"), [([0, 0, 0], 0.005), ([0.3, -0.3, 0.26], 0.01)])

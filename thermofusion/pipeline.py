@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 STAGES = (
     Stage("tracking", ("input", "subject", "tracking")),
     Stage("surface", ("input", "subject", "surface")),
-    Stage("rig", ("input", "rig"), edition=2),
-    Stage("mapping", ("input", "mapping"), edition=3),
-    Stage("temperature", ("mapping", "temperature"), edition=3, handed_out=RESULT),
+    Stage("rig", ("input", "rig"), edition=3),
+    Stage("mapping", ("input", "mapping"), edition=4),
+    Stage("temperature", ("mapping", "temperature"), edition=4, handed_out=RESULT),
 )
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
 

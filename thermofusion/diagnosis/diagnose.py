@@ -25,6 +25,7 @@ VOCABULARY = MappingProxyType(
         "readings agree by place in the image": "record more views in which the same skin crosses the whole image",
         "surface that is not skin": "take off what can be taken off; its temperature is not the skin's",
         "dead pixels": "have the camera's list of bad pixels renewed",
+        "depth scale is off": "measure something of known size with the depth camera, and the spacing of the cameras",
         "time stamps jitter": "let camera or software stamp each thermal frame when it is taken, not when it is stored",
         "outlines do not fit": "check the thermal clock, the rig and that nobody moved; repeat the scan more slowly",
         "references contradict each other": "let references and camera warm up, and show them in more frames",
@@ -60,31 +61,47 @@ def diagnose(mapped: Mapped, temperature: Temperature, image_px: tuple[int, int]
     if calibration is not None:
         found += _patterns(calibration)
         found += _references(calibration)
-    other = (temperature.mesh.flags & VertexFlag.NOT_SKIN) > 0
-    if other.any():
-        T = temperature.mesh.temperature_degC
-        size = abs(float(np.nanmedian(T[other]) - np.nanmedian(T[~other])))
-        text = f"readings of {other.mean():.1%} of the surface change with the angle as skin's do not"
-        done = "flagged NOT_SKIN, kept out of calibration and statistics"
-        found.append(Diagnosis("surface that is not skin", text, size, "where the flag stands", done))
+    found += _skin(temperature)
+    found += _outlines(mapped)
     if len(mapped.bad_pixels):
         share = len(mapped.bad_pixels) / (image_px[0] * image_px[1])
         evidence = f"{len(mapped.bad_pixels)} pixels ({share:.2%}) stand outside their neighbours in frame after frame"
         found.append(Diagnosis("dead pixels", evidence, None, "single pixels", "left out"))
-    if mapped.jitter_s > 0:
-        text = f"outlines of single views stand where they belong {1e3 * mapped.jitter_s:.0f} ms earlier or later"
-        done = "each frame's time was solved for from its outline"
-        found.append(
-            Diagnosis("time stamps jitter", text, None, "thermal frames", done, size=1e3 * mapped.jitter_s, unit="ms")
-        )
-    if mapped.outline_px > OUTLINE_PX:
-        evidence = (
-            f"{mapped.outline_px:.2f} px between the outlines of model and image (clean scans: below {OUTLINE_PX})"
-        )
-        done = "the uncertainty of places on a slope of temperature grew with it"
-        found.append(Diagnosis("outlines do not fit", evidence, None, "at the body's outline", done))
     found.sort(key=lambda d: -(d.size_K or 0.0))
     return tuple(replace(d, advice=VOCABULARY[d.what]) for d in found)
+
+
+def _skin(temperature: Temperature) -> list[Diagnosis]:
+    other = (temperature.mesh.flags & VertexFlag.NOT_SKIN) > 0
+    if not other.any():
+        return []
+    T = temperature.mesh.temperature_degC
+    size = abs(float(np.nanmedian(T[other]) - np.nanmedian(T[~other])))
+    text = f"readings of {other.mean():.1%} of the surface change with the angle as skin's do not"
+    done = "flagged NOT_SKIN, kept out of calibration and statistics"
+    return [Diagnosis("surface that is not skin", text, size, "where the flag stands", done)]
+
+
+def _outlines(m: Mapped) -> list[Diagnosis]:
+    """Clock, scale, and what is left."""
+    found = []
+    if m.jitter_s > 0:
+        text = f"outlines of single views stand where they belong {1e3 * m.jitter_s:.0f} ms earlier or later"
+        done = "each frame's time was solved for from its outline"
+        found.append(
+            Diagnosis("time stamps jitter", text, None, "thermal frames", done, size=1e3 * m.jitter_s, unit="ms")
+        )
+    if m.depth_scale:
+        side = "far" if m.depth_scale > 0 else "near"
+        percent = 100 * abs(m.depth_scale)
+        text = f"outlines fit as if depth were {percent:.1f} % too {side}, or the spacing of the cameras as wrong"
+        done = "views were set onto the surface as they fit; the surface's size is left, and sigma grew by it"
+        found.append(Diagnosis("depth scale is off", text, None, "everywhere", done, size=percent, unit="%"))
+    if m.outline_px > OUTLINE_PX:
+        text = f"{m.outline_px:.2f} px between the outlines of model and image (clean scans: below {OUTLINE_PX})"
+        done = "the uncertainty of places on a slope of temperature grew with it"
+        found.append(Diagnosis("outlines do not fit", text, None, "at the body's outline", done))
+    return found
 
 
 def _patterns(c: Calibration) -> list[Diagnosis]:

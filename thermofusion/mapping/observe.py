@@ -91,7 +91,8 @@ class Mapped:
     left_out : thermal frames that did not enter, by reason. motion : corrections of single views, if asked for.
     bad_pixels : (B, 2) u, v px of dead, stuck or blinking pixels, which were left out.
     outline_px : what the rig's alignment left between the outlines of model and image, NaN = not measured.
-    jitter_s : one sigma of what single thermal frames' stamps lacked and was put right.
+    jitter_s : one sigma of what single thermal frames' stamps lacked and was put right. depth_scale : depth over truth
+    less 1, as outlines ask for it, 0 = no news.
     """
 
     views: ThermalViews
@@ -102,6 +103,7 @@ class Mapped:
     bad_pixels: Int = field(default_factory=lambda: np.zeros((0, 2), np.int32))
     outline_px: float = float("nan")
     jitter_s: float = 0.0
+    depth_scale: float = 0.0
 
     __repr__ = brief
 
@@ -133,7 +135,9 @@ def observe(
     observations = observe_views(stream, SurfaceRays(surface), views, converter, mapping, progress=progress)
     blackbodies = read_blackbodies(stream, views, scan.references, converter)
     uv = np.argwhere(bad)[:, ::-1].astype(np.int32)
-    return Mapped(views, left_out, observations, blackbodies, motion, uv, rig.residual_px_after, rig.jitter_s)
+    return Mapped(
+        views, left_out, observations, blackbodies, motion, uv, rig.residual_px_after, rig.jitter_s, rig.depth_scale
+    )
 
 
 def observe_views(

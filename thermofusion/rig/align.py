@@ -50,6 +50,8 @@ MIN_VIEWS = 6
 HELD_SHARE = 0.7  # a sigma this near to its prior's is the prior's
 SUPPORT_CHI2 = 24.3  # 99.9 % of chi-square with 7 degrees of freedom: below it the data do not ask for a change
 ALIKE = 0.9  # correlation above which the clock cannot be told from a motion of the rig
+SCALE_SIGMAS = 4.0  # by which a scale of the depth must stand out
+SCALE_LEFT_CHI2 = 16.8  # 99 % of chi-square with 6 degrees of freedom: more is left, and the scale is not the cause
 TIMES_ROUNDS = 2  # of solving for the rig, where the time of each view is unknown, too
 TOO_FEW = "too few points of the outline were found in the thermal images"
 CLOCK_UNSURE = 0.1  # of its prior's sigma: a clock known better is known, whatever it correlates with
@@ -64,6 +66,8 @@ class RigResult:
     outline_width_px : by how much the image's outline lies outside the model's (nuisance, not applied).
     changed : False = rig and clock are the scan's own. converged : the refinement came to rest.
     frame_dt_s : (F,) what the times of single thermal frames lack, None = nothing; jitter_s : one sigma of it.
+    depth_scale : depth over truth less 1, where outlines ask for it or for cameras that stand farther apart by this
+    share, and for nothing else; 0 = no news.
     """
 
     camera: ThermalCamera
@@ -77,6 +81,7 @@ class RigResult:
     messages: tuple[str, ...] = ()
     frame_dt_s: Float | None = None
     jitter_s: float = 0.0
+    depth_scale: float = 0.0
 
     __repr__ = brief
 
@@ -235,12 +240,31 @@ def _decided(outlines: OutlineSet, camera: ThermalCamera, solved: Solved, before
         converged=solved.converged,
         views_used=len(outlines.views),
         messages=(found, *_weak(cov)),
+        depth_scale=_depth_scale(change, cov, camera.T_thermal_depth[:3, 3]) if solved.converged else 0.0,
     )
     if supported and solved.converged:
         return result
     # a change that chance would explain is no news: the rig is as calibrated
     news = () if solved.converged else (f"the rig is left alone: a change ({found}) did not come to rest",)
     return replace(result, camera=camera, residual_px_after=before, changed=False, messages=news)
+
+
+def _depth_scale(change: Float, cov: Float, baseline_m: Float) -> float:
+    """Depth over truth less 1 that explains a change (7,) of the rig, covariance (7, 7), by itself; 0 where none does.
+
+    Where depth, and poses tracked with it, are too large by a factor, the model's outline is that of the true body seen
+    from cameras that stand farther apart by the same factor.
+    """
+    direction = np.zeros(7)
+    direction[TRANSLATION] = baseline_m
+    information = np.linalg.inv(cov)
+    square = float(direction @ information @ direction)
+    if square <= 0:
+        return 0.0
+    scale = float(direction @ information @ change) / square
+    left = change - scale * direction
+    explained = scale**2 * square > SCALE_SIGMAS**2 and float(left @ information @ left) < SCALE_LEFT_CHI2
+    return scale if explained else 0.0
 
 
 def _described(change: Float) -> str:

@@ -121,6 +121,7 @@ class _Task:
     paper_S: float
     distance_m: float  # typical
     middle_m: Float32  # (3,) of the body
+    body_m: float  # rms distance of vertices from it
     registration_over: float
     gain_pivot_K: float | None
     with_uncertainty: bool
@@ -129,6 +130,7 @@ class _Task:
     def of(cls, problem: ThermalProblem, calibration: Calibration | None, with_uncertainty: bool) -> _Task:
         rows, settings, given = problem.observations, problem.settings, problem.emissivity
         calibration = calibration if settings.method == "joint" else None
+        middle_m = np.median(problem.points_m, axis=0)
         return cls(
             calibration=calibration,
             given=given,
@@ -139,7 +141,8 @@ class _Task:
             slope_L=calibration.slope_L if calibration else skin_slope(problem.band, rows.radiance),
             paper_S=_paper_scale(rows, given, problem.band, problem.room) if settings.method == "paper" else 1.0,
             distance_m=float(np.median(rows.range_m)) if len(rows) else 0.0,
-            middle_m=np.median(problem.points_m, axis=0),
+            middle_m=middle_m,
+            body_m=float(np.sqrt(((problem.points_m - middle_m) ** 2).sum(1).mean())),
             registration_over=problem.errors.registration_over,
             gain_pivot_K=_gain_pivot_K(problem, calibration),
             with_uncertainty=with_uncertainty,
@@ -226,6 +229,7 @@ def _errors_of(
         registration_over=task.registration_over,
         pattern_K=0.0 if calibration is None else calibration.pattern_sigma_K,
         gain_pivot_K=task.gain_pivot_K,
+        body_m=task.body_m,
     )
     views_K = None if calibration else columns["spread_K"]
     path_m = columns["distance_m"] - task.distance_m

@@ -94,7 +94,7 @@ class ThermalProblem:
             room=room,
             L_reflected=np.full(len(surface), L_room),
             around=surroundings(surface) if settings.crosscal.surroundings else None,
-            errors=replace(ErrorModel.of(camera, settings), aligned_px=mapped.outline_px),
+            errors=ErrorModel.of(camera, settings).aligned(mapped.outline_px, mapped.depth_scale),
             blackbodies=expected_readings(mapped.blackbodies, scan.references, band, L_room),
             contacts=contact_readings(scan.references, surface, band, scan.root),
             vertices_per_patch=vertices_per_patch(surface, normal_window_m),

@@ -6,7 +6,7 @@ that the camera reports, so that 1/Σσ² is the observation's statistical weigh
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,8 @@ class ErrorModel:
     where it is not fitted. sigma_registration_px : of the thermal image on the surface. sigma_reflected_K : of the
     room's reflected temperature. gradient_K_per_m : temperature gradient along the surface, scalar or (V,).
     sigma_emissivity0 : of ε(0). sigma_gain : of the camera's gain. sigma_depth_scale : of the depth camera's scale.
-    aligned_px : what the alignment left between the outlines, NaN = not measured. psf_sigma_px : point spread of the
+    aligned_px : what the alignment left between the outlines, NaN = not measured; depth_scale : error of the depth's
+    scale that it asks for. psf_sigma_px : point spread of the
     thermal image, which mixes room into skin at silhouettes; edge_margin_px : how much nearer a silhouette may be than
     the mesh says.
     """
@@ -49,6 +50,7 @@ class ErrorModel:
     sigma_gain: float = 0.0
     sigma_depth_scale: float = 0.0
     aligned_px: float = float("nan")
+    depth_scale: float = 0.0
     psf_sigma_px: float = DEFAULT_PSF_PX
     edge_margin_px: float = EDGE_MARGIN_PX
     gradient_K_per_m: float | Float32 = 0.0
@@ -58,6 +60,10 @@ class ErrorModel:
         """What the alignment left of the outlines over the stated registration error; 1 where it was not measured."""
         known = np.isfinite(self.aligned_px) and self.sigma_registration_px > 0
         return self.aligned_px / self.sigma_registration_px if known else 1.0
+
+    def aligned(self, outline_px: float, depth_scale: float) -> ErrorModel:
+        """With what the alignment left of the outlines, px, and the error of the depth's scale that they ask for."""
+        return replace(self, aligned_px=outline_px, depth_scale=depth_scale)
 
     @classmethod
     def of(cls, camera: ThermalCamera, settings: TemperatureSection) -> ErrorModel:
@@ -231,7 +237,7 @@ class Budget:
     solved for; epsilon0_follows : ε(0) with it. level_sigma_K : of the common level, NaN without a reference.
     sigma_normal_deg : as the residuals show it. registration_over : the alignment's own residual over the stated one.
     pattern_K : of what residuals still have in common by place in the image. gain_pivot_K : where an error of the gain
-    changes nothing; None: the gain was solved for.
+    changes nothing; None: the gain was solved for. body_m : rms distance of vertices from the body's middle.
     """
 
     errors: ErrorModel
@@ -248,6 +254,7 @@ class Budget:
     registration_over: float
     pattern_K: float
     gain_pivot_K: float | None
+    body_m: float
 
     @property
     def divisor(self) -> float:
@@ -278,13 +285,15 @@ def vertex_uncertainty(
     # to be right to a third of itself.
     air_loss = AIR_LOSS_PER_M if b.transmission_per_m == 1 else (1 - b.transmission_per_m) / 3
     modes = scale * levers.modes
+    # A scale that is known to be wrong shifts places against each other; which one stays nobody knows.
+    shift_m = np.hypot(errors.sigma_depth_scale * radius_m, errors.depth_scale * np.hypot(radius_m, b.body_m))
     parts = {
         "noise": scale * errors.netd_K * b.slope_L * np.sqrt(BILINEAR_VARIANCE * levers.squared),
         "calibration": np.sqrt((modes**2).sum(1)),
         "shape": zero if b.shape_fitted else scale * np.abs(x * levers.loss) * errors.sigma_shape,
         "normals": scale * np.abs(x) * tilt * normal,
         "registration": np.asarray(errors.gradient_K_per_m) * levers.registration_m * b.registration_over,
-        "scale": np.asarray(errors.gradient_K_per_m) * radius_m * errors.sigma_depth_scale * ALONG_SURFACE,
+        "scale": np.asarray(errors.gradient_K_per_m) * shift_m * ALONG_SURFACE,
         "pattern": zero + b.pattern_K,
         "silhouette": scale * np.abs(x) * levers.silhouette,
         "air": zero if b.air_K is None else np.abs(T_K - b.air_K) * air_loss * np.abs(path_m),
