@@ -18,7 +18,8 @@ from thermofusion.scans.overlay import looks_mirrored
 from thermofusion.tracking.recorded import believed
 from thermofusion.types import Trajectory
 
-ELSEWHERE = {"native", "azure-mkv", "realsense-bag", "flir", "fakenect", "apc-shelf", "jhu"}  # tests of their own
+# Tests of their own.
+ELSEWHERE = {"native", "recording", "azure-mkv", "realsense-bag", "flir", "fakenect", "apc-shelf", "jhu"}
 
 
 def test_every_format_has_a_writer_or_tests_of_its_own():

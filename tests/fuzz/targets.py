@@ -20,6 +20,7 @@ import pytest
 import scipy.io
 from support import foreign, result_maker
 from support import scan_maker as make
+from support.fake_device import Steady
 
 from thermofusion.calibration.board.board import Board
 from thermofusion.calibration.board.picks import read_picks_csv, read_picks_mat
@@ -38,6 +39,7 @@ from thermofusion.files.tum import read_trajectory
 from thermofusion.judge.compare import load_temperatures
 from thermofusion.judge.contacts import read_contacts
 from thermofusion.recipe import load_recipe
+from thermofusion.recording.record import Until, record
 from thermofusion.results.artifacts import load_artifact, load_note, save_artifact
 from thermofusion.scans import open_scan, with_rig
 from thermofusion.scans.check import verify
@@ -70,6 +72,7 @@ def targets(scratch: Path) -> Iterator[Target]:
         yield _folder(name, scratch, partial(_makers, name), _open_maker)
     yield Target("frames", _frames(), _in_file(scratch / "frames", _read_frames), 3)
     yield _folder("fakenect", scratch, _fakenect, _open_foreign)
+    yield _folder("recording", scratch, _recording, _open_foreign, 2)
     yield Target("mkv", {"take.mkv": _mkv()}, _in_file(scratch / "mkv", _open_mkv), 2)
     yield Target("trajectory", {"t.txt": b"# time\n0 0 0 0 0 0 0 1\n0.5 0.1 0 0 0 0 0 1\n"},
                  _in_file(scratch / "poses", read_trajectory), 2)  # fmt: skip
@@ -203,6 +206,12 @@ def _makers(name: str, root: Path) -> None:
 def _open_maker(root: Path, name: str) -> None:
     inside = [f for f in root.iterdir() if f.suffix in (".r3d", ".db", ".sens")]
     _open_foreign(inside[0] if inside else root, name)
+
+
+def _recording(root: Path) -> None:
+    """recording.mcap with eight small frames of two streams."""
+    devices = [partial(Steady, rate_hz=500.0, frames=8), partial(Steady, "heat", "thermal", 500.0, 8)]
+    record(devices, root, Until(), own_process=False)
 
 
 def _mkv() -> bytes:

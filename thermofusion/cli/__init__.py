@@ -19,7 +19,7 @@ import typer
 
 from ..errors import INTERRUPTED, INTERRUPTED_SENTENCE, ThermofusionError
 from ..version import __version__
-from . import calibrate, inspect, judge, paper, process, recordings, report, thermal
+from . import calibrate, inspect, judge, paper, process, record, recordings, report, thermal
 from .console import READER_GONE, fail, help_alone, leave
 
 app = typer.Typer(
@@ -28,7 +28,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (process, report, inspect, recordings, judge, calibrate, thermal, paper):
+for group in (process, report, inspect, record, recordings, judge, calibrate, thermal, paper):
     group.register(app)
 
 

@@ -9,11 +9,16 @@ from typing import Literal, Protocol
 from ..errors import ResourceError
 
 StreamKind = Literal["depth", "color", "thermal", "infrared", "gravity"]
+BYTES_PER_PIXEL = {"mono16": 2, "16UC1": 2, "bayer_grbg8": 1, "mono8": 1, "rgb8": 3, "32FC1": 4, "float64": 8}
 POLL_S = 0.1  # the longest that `read` waits: so soon a stop is heard
 
 
 class UnpluggedError(ResourceError):
     """The device has gone from the bus: what it delivered before stays."""
+
+
+class EndOfStreamError(ResourceError):
+    """The device has delivered all that it has: a replay at its end."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +44,7 @@ class StreamInfo:
     @property
     def bytes_per_frame(self) -> int:
         """Size of a frame's data."""
-        per_pixel = {"mono16": 2, "16UC1": 2, "bayer_grbg8": 1, "mono8": 1, "rgb8": 3, "float64": 8}[self.encoding]
-        return self.width_px * self.height_px * per_pixel
+        return self.width_px * self.height_px * BYTES_PER_PIXEL[self.encoding]
 
 
 @dataclass(frozen=True, eq=False)

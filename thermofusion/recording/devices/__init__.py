@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from ...errors import ResourceError
-from ..device import Device
+from ..device import Device, UnpluggedError
 from ..usb import usb_devices
 from . import infiray, kinect, lepton, p2pro, seek
 
@@ -57,6 +57,14 @@ def cameras(devices: Sequence[Any] | None = None) -> list[Found]:
         parts = _motor_of(device, devices) if ids in kinect.CAMERAS else ()
         found.append(Found(KNOWN[ids], ids, device.bus or 0, device.address or 0, device, parts))
     return found
+
+
+def open_camera(ids: tuple[int, int], bus: int, address: int, video: Literal["color", "infrared"] = "color") -> Device:
+    """A camera by its place on the bus, in whatever process asks. Raises UnpluggedError if it is not there."""
+    for found in cameras():
+        if (found.ids, found.bus, found.address) == (ids, bus, address):
+            return found.open(video)
+    raise UnpluggedError(f"{KNOWN.get(ids, 'the camera')} is not at {bus}:{address} any more", hint="plug it in again")
 
 
 def _motor_of(camera: Any, devices: Sequence[Any]) -> tuple[Any, ...]:

@@ -21,6 +21,7 @@ from ...files.pnm import read_pnm
 from ...files.reading import inside, read_bytes, read_head, text_lines
 from ...geometry.rigid import pose
 from ...types import Float, Scan
+from ..clock import unwrapped_s
 from ..common import ImageFiles, image_stream, make_camera, make_rig
 from ..stated import NOTHING, Stated
 
@@ -80,7 +81,8 @@ def recognise(path: Path) -> bool:
 def read(path: Path, stated: Stated = NOTHING, constants: KinectDepth = KinectDepth()) -> Scan:
     """A fakenect folder as a scan: depth in whole millimetres by `constants`, nominal cameras."""
     entries = _entries(path)
-    times = unwrap_ticks(np.array([e.wall_s for e in entries]), np.array([e.ticks for e in entries]))
+    walls, ticks = np.array([e.wall_s for e in entries]), np.array([e.ticks for e in entries])
+    times = unwrapped_s(walls, ticks, TICK_HZ, TICK_WRAP)
     rows = {kind: [i for i, e in enumerate(entries) if e.kind == kind] for kind in "dra"}
     if not rows["d"]:
         raise ScanError("no depth frames are listed", place=path / "INDEX.txt")
@@ -118,17 +120,6 @@ def read(path: Path, stated: Stated = NOTHING, constants: KinectDepth = KinectDe
             *_gravity(path, [entries[i] for i in rows["a"]]),
         ),
     )
-
-
-def unwrap_ticks(wall_s: Float, ticks: NDArray) -> Float:
-    """Seconds since the first entry by the device's clock: ticks unwrapped at 2^32 with wall time as the coarse hand.
-
-    wall_s, ticks : (N,). Right as long as wall time is good to half a wrap (35 s), over gaps of any length.
-    """
-    ticks = ticks.astype(np.float64)
-    expected = ticks[0] + (wall_s - wall_s[0]) * TICK_HZ
-    turns = np.rint((expected - ticks) / TICK_WRAP)
-    return (ticks + turns * TICK_WRAP - ticks[0]) / TICK_HZ
 
 
 def decode_depth(data: bytes, place: object, table: NDArray[np.uint16]) -> NDArray[np.uint16]:

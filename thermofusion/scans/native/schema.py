@@ -245,14 +245,15 @@ def thermal_camera_of(doc: ThermalCameraDoc, extrinsics: ExtrinsicsDoc, path: Pa
         text = f"expected two wavelengths in 1-30 um that rise by at least {MIN_BAND_UM} um, got {lo}, {hi}"
         raise ScanError(f"key 'cameras.thermal.band_um': {text}", place=path)
     lens, T = camera_of(doc, "cameras.thermal", path), _extrinsic(extrinsics, "thermal", path)
-    signal = SignalCurve() if doc.signal is None else _signal(doc.signal, path)
+    signal = SignalCurve() if doc.signal is None else signal_of(doc.signal, path)
     try:
         return ThermalCamera(lens, T, signal, doc.band_um, doc.netd_K, doc.time_offset_s, doc.psf_sigma_px)
     except ValueError as e:
         raise ScanError(str(e), place=f"{path}: key 'extrinsics'") from None
 
 
-def _signal(doc: SignalDoc, path: Path) -> SignalCurve:
+def signal_of(doc: SignalDoc, path: Path) -> SignalCurve:
+    """A signal group as a curve. Raises ScanError."""
     if doc.kind != "counts":
         return SignalCurve(doc.kind)
     if doc.curve is None:
@@ -264,7 +265,7 @@ def curve_of_file(path: Path) -> SignalCurve:
     """A curve of counts from a JSON file: the `curve` group, or a `signal` group, of scan.json. Raises ScanError."""
     tree = read_json(path)
     if isinstance(tree, dict) and "kind" in tree:
-        return _signal(validated(SignalDoc, tree, path), path)
+        return signal_of(validated(SignalDoc, tree, path), path)
     doc = validated(CurveDoc, tree, path)
     return SignalCurve("counts", doc.type, _curve_parameters(doc, path))
 
