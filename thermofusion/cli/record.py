@@ -87,11 +87,12 @@ def record(
     from ..recording.record import Beside, Until
     from ..recording.record import record as into
 
+    named(out)
     openers, said, rig = _opened(sources, room)
     shown = _Shown(json)
     with _keys(ends.wait) as control:
         until = Until(ends.seconds, ends.frames, ends.shutter_every, ends.wait)
-        result = into(openers, named(out), until, control=control, status=shown, beside=Beside(said, rig))
+        result = into(openers, out, until, control=control, status=shown, beside=Beside(said, rig))
     shown.done()
     streams = {n: {"frames": s.frames, "lost": s.lost} for n, s in result.streams.items()}
     size = f"{result.size_bytes / 2**20:.1f} MiB"
