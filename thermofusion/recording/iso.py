@@ -88,7 +88,7 @@ class IsoQueue:
         self._buffers.append(buffer)
         t = transfer.contents
         t.dev_handle, t.endpoint, t.type, t.timeout = self._handle.handle, endpoint, ISOCHRONOUS, 0
-        t.buffer = ctypes.cast(buffer, type(t.buffer))
+        t.buffer = ctypes.addressof(buffer)
         t.length, t.num_iso_packets, t.callback = len(buffer), self._packets, self._callback
         for packet in self._usb._get_iso_packet_list(t):
             packet.length = size
@@ -114,7 +114,7 @@ class IsoQueue:
             self._gone = True
 
     def _keep(self, t: Any, now: int) -> None:
-        address = ctypes.cast(t.buffer, ctypes.c_void_p).value or 0
+        address = t.buffer
         for packet in self._usb._get_iso_packet_list(t):
             if packet.status == 0 and packet.actual_length:
                 if len(self._waiting) >= MAX_WAITING:
