@@ -108,6 +108,11 @@ class RigSection(_Section):
     """The thermal camera's place and clock."""
 
     align: bool = Field(True, description="refine the rig extrinsic and the thermal clock where the data support it")
+    mount: Literal["auto", "rig", "free"] = Field(
+        "auto",
+        description="free: the thermal camera is not on the depth rig, each view is placed by outline and pattern; "
+        "auto: as the scan says",
+    )
 
 
 class MappingSection(_Section):

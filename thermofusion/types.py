@@ -155,7 +155,8 @@ class ThermalCamera:
 
     lens : pinhole and distortion. T_thermal_depth : (4, 4). band_um : wavelengths it sees. netd_K : noise of a pixel,
     one sigma. time_offset_s : added to a thermal frame's own time to get the depth clock's. psf_sigma_px : optical and
-    pixel point spread; None = not measured. Raises ValueError for a transform that is not rigid.
+    pixel point spread; None = not measured. mount : `free` = not on the depth camera's rig: T_thermal_depth and
+    time_offset_s then mean nothing. Raises ValueError for a transform that is not rigid.
     """
 
     lens: Camera
@@ -165,6 +166,7 @@ class ThermalCamera:
     netd_K: float = 0.05
     time_offset_s: float = 0.0
     psf_sigma_px: float | None = None
+    mount: Literal["rig", "free"] = "rig"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_thermal_depth", check_rigid(self.T_thermal_depth, "T_thermal_depth"))

@@ -46,6 +46,9 @@ class ThermalOptions:
     clock_offset: Annotated[
         str | None, typer.Option(help="Seconds added to thermal's times, or auto: found from what moves in both.")
     ] = None
+    free: Annotated[
+        bool, typer.Option("--free", help="The thermal camera is not on the depth rig: held by itself, or on a stand.")
+    ] = False
     gain: Annotated[float | None, typer.Option(help="degC = gain * stored value + offset.")] = None
     offset_degC: Annotated[float | None, typer.Option("--offset-degC", help="See --gain.")] = None
     curve: Annotated[Path | None, typer.Option(help="JSON of a signal's curve (docs/scan-format.md).")] = None
@@ -72,7 +75,7 @@ def import_(
 
     if added.thermal is not None and depth.rig is None:
         raise RecipeError(
-            "--thermal needs --rig: where the thermal camera sits",
+            "--thermal needs --rig: the thermal camera's lens, and where it sits",
             hint="`thermofusion calibrate PICTURES -o rig.json` writes one",
         )
     if added.thermal is None and _said_of_thermal(added):
@@ -105,7 +108,7 @@ def _said_of_thermal(o: ThermalOptions) -> list[str]:
         "--offset-degC": o.offset_degC,
     }
     given |= {"--curve": o.curve, "--band": o.band}
-    return [name for name, value in given.items() if value is not None]
+    return [name for name, value in given.items() if value is not None] + ["--free"] * o.free
 
 
 def _join(scan: Scan, o: ThermalOptions, rig: Path) -> Scan:
@@ -116,14 +119,16 @@ def _join(scan: Scan, o: ThermalOptions, rig: Path) -> Scan:
     from ..scans.thermal import read_thermal, with_times
 
     assert o.thermal is not None
-    camera = thermal_camera(rig)
+    camera = thermal_camera(rig, free=o.free)
     frames = read_thermal(o.thermal, _said(o, camera.signal), camera.lens.shape)
     if o.times is not None:
         frames = with_times(frames, times_of(o.times, frames.places, range(len(frames))))
     elif o.fps is not None and (fps := _positive(o.fps, "--fps")):
         frames = with_times(frames, [i / fps for i in range(len(frames))])
     if o.clock_offset is None:
-        return with_thermal(scan, frames, rig, band_um=_band(o.band))
+        return with_thermal(scan, frames, rig, band_um=_band(o.band), free=o.free)
+    if camera.mount == "free":
+        raise RecipeError("--clock-offset means nothing for a thermal camera that is not on the rig")
     if o.clock_offset != "auto":
         times = frames.times_s + _number("--clock-offset", o.clock_offset)
         return with_thermal(scan, frames, rig, times_s=times, band_um=_band(o.band))

@@ -38,11 +38,11 @@ class Contour:
 class OutlineCaster:
     """A mesh prepared for casting its outline into any view."""
 
-    def __init__(self, mesh: SurfaceMesh, camera: Camera) -> None:
+    def __init__(self, mesh: SurfaceMesh, camera: Camera, steps_across: int = GRID_STEPS_ACROSS) -> None:
         self._scene = RayScene(mesh.vertices_m, mesh.triangles)
         self._mesh = mesh
-        self._border = _border_tree(mesh)
-        self._step = max(1, round(camera.width_px / GRID_STEPS_ACROSS))
+        self._border = border_tree(mesh)
+        self._step = max(1, round(camera.width_px / steps_across))
         u, v = np.meshgrid(
             np.arange(self._step / 2, camera.width_px, self._step),
             np.arange(self._step / 2, camera.height_px, self._step),
@@ -87,7 +87,7 @@ class OutlineCaster:
         return Contour(point, normal)
 
 
-def _border_tree(mesh: SurfaceMesh) -> cKDTree | None:
+def border_tree(mesh: SurfaceMesh) -> cKDTree | None:
     """Search tree of the vertices on open borders: on edges with one triangle only. None for a closed mesh."""
     edges, border = undirected_edges(mesh.triangles)
     ends = np.unique(edges[border])

@@ -122,10 +122,14 @@ def observe(
 
     Raises ScanError if no thermal frame can be placed, or no view sees the surface.
     """
-    views, left_out = thermal_views(scan, trajectory, input.max_pose_gap_ms / 1e3, rig.camera, rig.frame_dt_s)
-    assert scan.thermal is not None
+    if scan.thermal is None or len(scan.thermal) == 0:
+        raise ScanError("the scan has no thermal frames", place=scan.root)
     stream, motion = scan.thermal, None
-    if mapping.view_motion:
+    if rig.free is not None:
+        views, left_out = rig.free.views(stream), rig.free.left_out
+    else:
+        views, left_out = thermal_views(scan, trajectory, input.max_pose_gap_ms / 1e3, rig.camera, rig.frame_dt_s)
+    if mapping.view_motion and rig.free is None:  # free views follow the outline one by one already
         motion = view_corrections(stream, surface, views, rig.outline_width_px, progress=progress)
         views = replace(views, T_world_thermal=motion.T_world_thermal)
     converter = SignalConverter(stream.camera)

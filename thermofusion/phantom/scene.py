@@ -113,10 +113,9 @@ class RoomConfig(_Strict):
 
 
 @dataclass(frozen=True)
-class WalkConfig(_Strict):
-    """The path of the hand-held rig (or of the subject on a turntable, the rig at rest)."""
+class PathConfig(_Strict):
+    """The path of a hand-held camera round the subject."""
 
-    subject_turns: bool = False
     turns: float = 1.0
     start_deg: float = 0.0  # 0 = in front of the subject
     radius_m: Positive = 1.1
@@ -130,9 +129,25 @@ class WalkConfig(_Strict):
     roll_deg: float = 0.0  # 90 = portrait
     tremor_mm: NotNegative = 0.0  # of the hand, rms
     tremor_deg: NotNegative = 0.0
+
+
+@dataclass(frozen=True)
+class WalkConfig(PathConfig):
+    """The path of the hand-held rig (or of the subject on a turntable, the rig at rest)."""
+
+    subject_turns: bool = False
     depth_frames: Annotated[int, Field(ge=3)] = 180
     depth_hz: Positive = 15.0
     poses: Literal["given", "withheld"] = "given"
+
+
+@dataclass(frozen=True)
+class ApartConfig(PathConfig):
+    """A thermal camera that is not on the rig: held by itself on a path of its own, or (turns = 0) on a stand."""
+
+    frames: Annotated[int, Field(ge=1)] = 60
+    hz: Positive = 5.0
+    start_s: float = 0.0  # of its recording after depth's; may be negative, or hours
 
 
 @dataclass(frozen=True)
@@ -180,6 +195,7 @@ class ThermalConfig(_Strict):
     vignetting_K: float = 0.0  # what an image corner shows too little
     drift: DriftConfig = DriftConfig()
     blackbody: BlackbodyConfig | None = None
+    apart: ApartConfig | None = None  # None = on the rig, `every` and `phase_s` count; else these two do not
 
 
 @dataclass(frozen=True)

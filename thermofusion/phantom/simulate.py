@@ -28,14 +28,16 @@ from .thermal_cameras import (
     thermal_camera,
     vignetting_field,
 )
-from .walk import Motion, color_rig, held_up, thermal_rig
+from .walk import ApartMotion, Motion, color_rig, held_up, thermal_rig
 from .writing import camera_json, whole_folder, write_frames, write_image, write_json, write_trajectory
 
 BREATH_LEVELS = 12  # the breathing surface is cast in so many steps: 0.4 mm apart for 5 mm
 COLOR_DISTORTION = (0.045, -0.11, 0.0007, -0.0009, 0.03)  # k1 k2 p1 p2 k3
 
 # one random stream for each purpose: adding a colour camera must not change the thermal noise
-SEED_SKIN, SEED_EXCHANGE, SEED_MOTION, SEED_RIG, SEED_DRIFT, SEED_DEPTH, SEED_THERMAL, SEED_TEXTURE = range(8)
+SEED_SKIN, SEED_EXCHANGE, SEED_MOTION, SEED_RIG, SEED_DRIFT, SEED_DEPTH, SEED_THERMAL, SEED_TEXTURE, SEED_APART = range(
+    9
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,10 +59,19 @@ class Phantom:
     thermal_times_s: Float  # true exposure times, depth clock
     offsets_K: Float
     shutter: Bool
+    apart: ApartMotion | None = None  # of a thermal camera that is not on the rig
 
     def rng(self, *stream: int) -> np.random.Generator:
         """The random numbers of one purpose (and frame)."""
         return np.random.default_rng([self.seed, *stream])
+
+    def thermal_poses(self, times_s: Float) -> tuple[Float, Float]:
+        """T_body_thermal and T_world_thermal, (N, 4, 4), at times (N,) s."""
+        if self.apart is None:
+            T_world_thermal = self.motion.T_world_depth(times_s) @ invert(self.T_thermal_depth)
+        else:
+            T_world_thermal = self.apart.T_world_thermal(times_s)
+        return invert(self.motion.T_world_body(times_s)) @ T_world_thermal, T_world_thermal
 
 
 def build_phantom(scene: SceneConfig, seed: int = 0) -> Phantom:
@@ -72,7 +83,8 @@ def build_phantom(scene: SceneConfig, seed: int = 0) -> Phantom:
     true_rig, written_rig = thermal_rig(scene.rig, stream(SEED_RIG))
     walk = scene.walk
     depth_times = np.arange(walk.depth_frames) / walk.depth_hz
-    thermal_times = depth_times[:: scene.thermal.every] + scene.thermal.phase_s
+    apart = None if scene.thermal.apart is None else ApartMotion.of(scene.thermal.apart, stream(SEED_APART))
+    thermal_times = depth_times[:: scene.thermal.every] + scene.thermal.phase_s if apart is None else apart.times_s
     offsets, shutter = draw_drift(scene.thermal.drift, thermal_times, stream(SEED_DRIFT))
     color = None
     if scene.color is not None:
@@ -95,6 +107,7 @@ def build_phantom(scene: SceneConfig, seed: int = 0) -> Phantom:
         thermal_times,
         offsets,
         shutter,
+        apart,
     )
 
 
@@ -180,7 +193,7 @@ class Studio:
     def radiance(self, i: int) -> np.ndarray:
         """What reaches the thermal lens in frame i, supersampled: (S·H, S·W) float32, W m-2 sr-1."""
         p, t = self.phantom, float(self.phantom.thermal_times_s[i])
-        T_body, T_world = self.poses(t, p.T_thermal_depth)
+        T_body, T_world = (T[0] for T in p.thermal_poses(np.array([t])))
         image = render_thermal(
             self.subject(t), p.thermal.camera, self.thermal_rays, p.scene.room, p.thermal.band, T_body, T_world
         )
@@ -272,7 +285,11 @@ def scan_document(phantom: Phantom) -> dict[str, Any]:
     }
     if thermal.psf_sigma_px > 0:
         cameras["thermal"]["psf_sigma_px"] = thermal.psf_sigma_px
-    extrinsics = {"T_thermal_depth": phantom.T_thermal_depth_written.tolist()}
+    extrinsics = {}
+    if phantom.apart is None:
+        extrinsics["T_thermal_depth"] = phantom.T_thermal_depth_written.tolist()
+    else:
+        cameras["thermal"]["mount"] = "free"
     if phantom.color is not None:
         cameras["color"] = camera_json(phantom.color, "simulated colour camera")
         extrinsics["T_color_depth"] = color_rig().tolist()
@@ -315,6 +332,9 @@ def _write_truth(phantom: Phantom, folder: Path) -> None:
     mesh, used = phantom.mesh, ~phantom.shutter
     times = phantom.depth_times_s
     write_trajectory(folder / "trajectory.txt", times, phantom.motion.T_body_depth(times))
+    if phantom.apart is not None:
+        T_body_thermal = phantom.thermal_poses(phantom.thermal_times_s)[0]
+        write_trajectory(folder / "thermal_trajectory.txt", phantom.thermal_times_s, T_body_thermal)
     np.savez_compressed(
         folder / "surface.npz",
         vertices_m=mesh.vertices_m,

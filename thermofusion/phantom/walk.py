@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from ..geometry.rigid import invert, se3_exp
 from ..types import Float
-from .scene import MotionConfig, RigConfig, WalkConfig
+from .scene import ApartConfig, MotionConfig, PathConfig, RigConfig, WalkConfig
 
 TREMOR_HZ = (0.4, 6.0)  # physiological tremor of an outstretched arm, and the walker's gait
 SWAY_HZ = (0.1, 0.6)  # quiet standing
@@ -101,7 +101,29 @@ class Motion:
         return self.breathing_mm / 2e3 * np.sin(2 * np.pi * self.breathing_hz * times_s)
 
 
-def path(walk: WalkConfig, phase: Float) -> Float:
+@dataclass(frozen=True, eq=False)
+class ApartMotion:
+    """Poses of a thermal camera that is not on the rig."""
+
+    walk: ApartConfig
+    tremor: Wobble
+
+    @classmethod
+    def of(cls, walk: ApartConfig, rng: np.random.Generator) -> ApartMotion:
+        return cls(walk, Wobble.random(walk.tremor_deg, walk.tremor_mm, TREMOR_HZ, rng))
+
+    @property
+    def times_s(self) -> Float:
+        """(N,) when it takes its pictures, depth clock."""
+        return self.walk.start_s + np.arange(self.walk.frames) / self.walk.hz
+
+    def T_world_thermal(self, times_s: Float) -> Float:
+        """(N,) -> (N, 4, 4)."""
+        since = times_s - self.walk.start_s
+        return path(self.walk, since * self.walk.hz / self.walk.frames) @ self.tremor.at(since)
+
+
+def path(walk: PathConfig, phase: Float) -> Float:
     """The path without tremor; phase (N,) runs from 0 to 1 over the recording. Returns T_world_depth (N, 4, 4)."""
     angle = 2 * np.pi * walk.turns * phase
     around = angle + np.radians(walk.start_deg) - np.pi / 2  # 0 = in front, at -y

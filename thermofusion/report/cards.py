@@ -44,7 +44,9 @@ def _quality(report: dict[str, Any]) -> list[str]:
         out.append(f"{tracking['tracked']} of {tracking['frames']} depth frames tracked")
     if _number(rig.get("residual_px_after")):
         out.append(f"thermal outlines fit to {rig['residual_px_after']:.2f} px")
-    if rig:
+    if rig.get("mount") == "free":
+        out.append(f"{rig['views_used']} thermal views placed to {rig['sigma_translation_mm']:.1f} mm")
+    elif rig:
         out.append(f"clock {rig['time_offset_s'] * 1e3:+.0f} ms")
     if _number(temperature.get("coverage")):
         out.append(f"{temperature['coverage']:.0%} of the surface measured")

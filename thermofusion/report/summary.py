@@ -21,6 +21,7 @@ from .metadata import radiometric_numbers, stated
 if TYPE_CHECKING:
     from ..mapping.observe import Mapped
     from ..rig.align import RigResult
+    from ..rig.free.place import FreeViews
     from ..surface.surface import SurfaceResult
     from ..temperature.solve import Temperature
     from ..tracking.track import TrackingResult
@@ -126,6 +127,9 @@ def _path(t: Mapping[str, Any]) -> str:
 
 def _rig_line(a: Mapping[str, Any]) -> str:
     fit = a["residual_px_after"]
+    if a.get("mount") == "free":
+        size = f"{a['sigma_translation_mm']:.1f} mm, {a['sigma_rotation_deg']:.2f}°"
+        return f"thermal camera by itself: {counted(a['views_used'], 'view')} placed to {size} (one sigma, median)"
     fits = "" if fit is None or not np.isfinite(fit) else f"; outlines fit to {fit:.2f} px"
     if not a["changed"]:
         return f"the thermal camera stays where the recording says{fits}"
@@ -184,6 +188,8 @@ def _surface(s: SurfaceResult) -> dict[str, Any]:
 
 
 def _rig(scan: Scan, a: RigResult) -> dict[str, Any]:
+    if a.free is not None:
+        return _free(scan, a, a.free)
     T = a.camera.T_thermal_depth
     start = T if scan.thermal is None else scan.thermal.camera.T_thermal_depth
     return {
@@ -199,6 +205,26 @@ def _rig(scan: Scan, a: RigResult) -> dict[str, Any]:
         "sigma_time_s": a.sigma_time_s,
         "jitter_s": a.jitter_s,
         "views_used": a.views_used,
+    }
+
+
+def _free(scan: Scan, a: RigResult, free: FreeViews) -> dict[str, Any]:
+    """A camera that is not on the rig: every view's sigma in place of one rig's."""
+    index = np.zeros(0, np.int64) if scan.thermal is None else scan.thermal.index
+    return {
+        "mount": "free",
+        "changed": a.changed,
+        "converged": a.converged,
+        "residual_px_after": a.residual_px_after,
+        "outline_width_px": a.outline_width_px,
+        "sigma_rotation_deg": float(np.median(free.sigma_rotation_deg)),
+        "sigma_translation_mm": float(np.median(free.sigma_translation_mm)),
+        "views_used": a.views_used,
+        "views": [
+            {"index": int(i), "sigma_rotation_deg": float(r), "sigma_translation_mm": float(t)}
+            for i, r, t in zip(index[free.frame], free.sigma_rotation_deg, free.sigma_translation_mm, strict=True)
+        ],
+        "not_placed": index[free.lost].tolist(),
     }
 
 

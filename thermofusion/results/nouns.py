@@ -26,6 +26,7 @@ def stored() -> MappingProxyType[str, type]:
     from ..mapping.observe import Mapped
     from ..mapping.references import BlackbodyReading
     from ..rig.align import RigResult
+    from ..rig.free.place import FreeViews
     from ..surface.clean import RemovedPart
     from ..surface.surface import SurfaceResult
     from ..temperature.crosscal import Calibration
@@ -50,6 +51,7 @@ def stored() -> MappingProxyType[str, type]:
             "blackbody-reading/1": BlackbodyReading,
             "calibration/1": Calibration,
             "camera/1": Camera,
+            "free-views/1": FreeViews,
             "image-field/1": ImageField,
             "lost-range/1": LostRange,
             "mapped/1": Mapped,

@@ -42,6 +42,7 @@ from .estimate import (
     prior_covariance,
     solve,
 )
+from .free.place import FreeViews, place_views
 from .jitter import frame_times
 from .outlines import read_outlines, search_shift
 
@@ -52,6 +53,7 @@ SUPPORT_CHI2 = 24.3  # 99.9 % of chi-square with 7 degrees of freedom: below it 
 ALIKE = 0.9  # correlation above which the clock cannot be told from a motion of the rig
 SCALE_SIGMAS = 4.0  # by which a scale of the depth must stand out
 SCALE_LEFT_CHI2 = 16.8  # 99 % of chi-square with 6 degrees of freedom: more is left, and the scale is not the cause
+MOST_NAMED = 8  # frames, in a message
 TIMES_ROUNDS = 2  # of solving for the rig, where the time of each view is unknown, too
 TOO_FEW = "too few points of the outline were found in the thermal images"
 CLOCK_UNSURE = 0.1  # of its prior's sigma: a clock known better is known, whatever it correlates with
@@ -68,6 +70,7 @@ class RigResult:
     frame_dt_s : (F,) what the times of single thermal frames lack, None = nothing; jitter_s : one sigma of it.
     depth_scale : depth over truth less 1, where outlines ask for it or for cameras that stand farther apart by this
     share, and for nothing else; 0 = no news.
+    free : where each view of a camera that is not on the rig was taken; rig and clock then mean nothing.
     """
 
     camera: ThermalCamera
@@ -82,6 +85,7 @@ class RigResult:
     frame_dt_s: Float | None = None
     jitter_s: float = 0.0
     depth_scale: float = 0.0
+    free: FreeViews | None = None
 
     __repr__ = brief
 
@@ -123,6 +127,8 @@ def align(
     if stream is None:
         raise ScanError("the scan has no thermal stream", place=scan.root, hint="there is nothing to align")
     camera, start = stream.camera, State.of(stream.camera)
+    if (camera.mount if rig.mount == "auto" else rig.mount) == "free":
+        return _free(scan, mesh, trajectory, progress)
     if not rig.align:
         return _unchanged(camera, "alignment is switched off by the recipe")
     frames = _frames(stream, trajectory, input.max_pose_gap_ms / 1e3)
@@ -154,6 +160,33 @@ def align(
         return _unchanged(camera, "the outline was found far from where the rig says, but did not come to rest there")
     text = f"{_described(State.of(result.camera).distance(start)[RIG])}: calibrate it again"
     return replace(result, changed=True, messages=(text, *result.messages[1:]))
+
+
+def _free(scan: Scan, mesh: SurfaceMesh, trajectory: Trajectory, progress: Progress) -> RigResult:
+    """Every view placed by itself; the covariance is that of a typical view."""
+    assert scan.thermal is not None
+    views, joint = place_views(scan, mesh, trajectory, progress)
+    covariance = np.full((7, 7), np.nan)
+    covariance[TWIST, TWIST] = np.median(views.covariance, axis=0)
+    messages = []
+    if len(views.lost):
+        named = ", ".join(str(int(i)) for i in scan.thermal.index[views.lost][:MOST_NAMED])
+        more = f" and {len(views.lost) - MOST_NAMED} more" if len(views.lost) > MOST_NAMED else ""
+        messages.append(f"thermal frames that could not be placed by the subject's outline: {named}{more}")
+    if not joint.converged:
+        messages.append("the thermal views' poses did not come to rest")
+    return RigResult(
+        scan.thermal.camera,
+        float("nan"),
+        float(np.hypot(joint.outline_px, views.pose_px(scan.thermal.camera.lens, joint.range_m))),
+        covariance,
+        outline_width_px=joint.width_px,
+        changed=True,
+        converged=joint.converged,
+        views_used=len(views.frame),
+        messages=tuple(messages),
+        free=views,
+    )
 
 
 def _frames(stream: ThermalStream, trajectory: Trajectory, max_gap_s: float) -> NDArray[np.intp]:

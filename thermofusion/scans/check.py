@@ -131,11 +131,11 @@ def _sample(stream: Stream, sample: int, *, usable_only: bool = True) -> list[in
 
 
 def _time_faults(scan: Scan, sample: int) -> None:
-    t = scan.depth.times_s
+    t, thermal = scan.depth.times_s, scan.thermal
     slack = 1.0 if len(t) < 2 else 0.5 * float(np.median(np.diff(t))) + 1e-3
     others = {
         "colour": None if scan.color is None else scan.color.times_s,
-        "thermal": None if scan.thermal is None else scan.thermal.depth_times_s,
+        "thermal": None if thermal is None or thermal.camera.mount == "free" else thermal.depth_times_s,
         "trajectory": None if scan.trajectory is None else scan.trajectory.times_s,
     }
     for name, u in others.items():
@@ -171,7 +171,7 @@ def _depth_faults(scan: Scan, sample: int) -> None:
             place=scan.root,
             hint="set cameras.depth.depth_unit_m (0.001 for millimetres)",
         )
-    if scan.thermal is not None:
+    if scan.thermal is not None and scan.thermal.camera.mount == "rig":
         camera = scan.thermal.camera
         seen = [_share_seen(d, scan.rig.depth, camera.lens, camera.T_thermal_depth) for d in frames]
         if max(seen) == 0:
@@ -398,7 +398,7 @@ def _sync_findings(scan: Scan) -> list[Finding]:
         severity: Severity = "ok" if away < 0.04 else "warning"
         text = f"nearest frame {away * 1e3:.1f} ms away (median), {np.abs(dt).max() * 1e3:.1f} ms at most"
         found.append(Finding(severity, "sync colour", text))
-    if scan.thermal is not None:
+    if scan.thermal is not None and scan.thermal.camera.mount == "rig":
         t, offset = scan.thermal.depth_times_s, scan.thermal.camera.time_offset_s
         outside = int(((t < scan.depth.times_s[0] - 0.1) | (t > scan.depth.times_s[-1] + 0.1)).sum())
         if outside:
@@ -412,7 +412,10 @@ def _sync_findings(scan: Scan) -> list[Finding]:
 
 def _extrinsic_findings(scan: Scan) -> list[Finding]:
     found = []
-    extrinsics = {} if scan.thermal is None else {"thermal": scan.thermal.camera.T_thermal_depth}
+    camera = None if scan.thermal is None else scan.thermal.camera
+    extrinsics = {"thermal": camera.T_thermal_depth} if camera is not None and camera.mount == "rig" else {}
+    if camera is not None and camera.mount == "free":
+        found.append(Finding("ok", "thermal mount", "free: every view is placed by the subject's outline"))
     if scan.rig.T_color_depth is not None:
         extrinsics["color"] = scan.rig.T_color_depth
     for name, T in extrinsics.items():
@@ -438,8 +441,9 @@ def _measure(scan: Scan, sample: int) -> dict:
         camera, convert = scan.thermal.camera, SignalConverter(scan.thermal.camera)
         degC = np.stack([_apparent_degC(scan.thermal, convert, i) for i in _sample(scan.thermal, sample)])
         out["thermal_degC"] = tuple(float(x) for x in np.nanpercentile(degC, [1, 50, 99]))
-        seen = [_share_seen(d, scan.rig.depth, camera.lens, camera.T_thermal_depth) for d in depth]
-        out["seen_by_thermal"] = float(np.mean(seen))
+        if camera.mount == "rig":
+            seen = [_share_seen(d, scan.rig.depth, camera.lens, camera.T_thermal_depth) for d in depth]
+            out["seen_by_thermal"] = float(np.mean(seen))
     shifts: dict[str, list[tuple[float, float]]] = {}
     for o in edge_overlays(scan, OVERLAY_FRAMES):
         if o.contrast >= MIN_OVERLAY_CONTRAST:

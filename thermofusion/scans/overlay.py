@@ -80,7 +80,7 @@ def _fits(overlay: Overlay) -> bool:
 
 def _others(scan: Scan) -> Iterator[tuple[str, Stream, Camera, Float, Float]]:
     """The cameras beside depth: name, images, lens, T_other_depth, and the images' times on the depth clock."""
-    if scan.thermal is not None:
+    if scan.thermal is not None and scan.thermal.camera.mount == "rig":
         camera = scan.thermal.camera
         yield "thermal", scan.thermal, camera.lens, camera.T_thermal_depth, scan.thermal.depth_times_s
     if scan.color is not None and scan.rig.color is not None and scan.rig.T_color_depth is not None:

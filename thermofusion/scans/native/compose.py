@@ -90,17 +90,22 @@ def _depth_corrected(scan: Scan, doc: DepthCorrectionDoc, path: Path) -> Scan:
     return replace(scan, depth=depth, depth_unit_m=unit_m, notes=(*scan.notes, f"depth corrected by {path.name}"))
 
 
-def thermal_camera(rig: str | Path) -> ThermalCamera:
-    """The thermal camera of a rig.json. Raises ScanError if it has none, or not its place."""
-    return _thermal_camera(Path(rig))[0]
+def thermal_camera(rig: str | Path, *, free: bool = False) -> ThermalCamera:
+    """The thermal camera of a rig.json; free : it hangs on no rig. Raises ScanError if it lacks one, or its place."""
+    return _thermal_camera(Path(rig), free)[0]
 
 
-def _thermal_camera(path: Path) -> tuple[ThermalCamera, bool]:
+def _thermal_camera(path: Path, free: bool) -> tuple[ThermalCamera, bool]:
     """The thermal camera of a rig.json, and whether the file tells its signal."""
     doc = validated(RigDoc, read_json(path), path)
-    if doc.cameras.thermal is None or doc.extrinsics.T_thermal_depth is None:
-        raise ScanError("'cameras.thermal' and 'extrinsics.T_thermal_depth' are needed to join thermal", place=path)
-    return thermal_camera_of(doc.cameras.thermal, doc.extrinsics, path), doc.cameras.thermal.signal is not None
+    group = doc.cameras.thermal
+    if group is not None and free:
+        group = group.model_copy(update={"mount": "free"})
+    if group is None or (group.mount == "rig" and doc.extrinsics.T_thermal_depth is None):
+        text = "'cameras.thermal' and 'extrinsics.T_thermal_depth' are needed to join thermal"
+        hint = "--free joins a thermal camera that is not on the rig: it needs 'cameras.thermal' alone"
+        raise ScanError(text, place=path, hint=hint)
+    return thermal_camera_of(group, doc.extrinsics, path), group.signal is not None
 
 
 def with_thermal(
@@ -110,11 +115,12 @@ def with_thermal(
     *,
     times_s: NDArray[np.float64] | None = None,
     band_um: tuple[float, float] | None = None,
+    free: bool = False,
 ) -> Scan:
     """A depth recording joined to thermal frames recorded apart, by a rig.json that has the thermal camera.
 
     times_s : (N,) of the thermal frames on the depth clock, where the files' own clock is another or is not stated.
-    band_um : of the camera, where it is not the rig's.
+    band_um : of the camera, where it is not the rig's. free : the camera is not on the rig; clocks do not matter then.
 
     The stored values go into the scan with their own curve, or the rig's where the files have none, so the temperature
     stays apparent; emissivity and reflection are the fusion's business. What the camera was told of the room fills what
@@ -122,11 +128,12 @@ def with_thermal(
     differs from the frames', a frame has no time, or none within the depth recording's time.
     """
     path = Path(rig)
-    if scan.times_assumed:
+    camera, tells_signal = _thermal_camera(path, free)
+    free = camera.mount == "free"
+    if scan.times_assumed and not free:
         text = "depth carries no times, so thermal frames have no place among them"
         hint = "give them: `thermofusion import DEPTH --times LIST -o SCAN`, then join thermal to SCAN"
         raise ScanError(text, place=scan.root, hint=hint)
-    camera, tells_signal = _thermal_camera(path)
     if frames.signal is None and not tells_signal:
         hint = "give --gain and --offset-degC, --curve, or a rig.json with cameras.thermal.signal"
         raise ScanError(
@@ -139,13 +146,16 @@ def with_thermal(
             f"the thermal frames are {w} x {h} px, the rig says {lens.width_px} x {lens.height_px}", place=path
         )
     times = frames.times_s if times_s is None else np.asarray(times_s, np.float64)
+    if free and not np.isfinite(times).all():  # their order is all that counts
+        times = np.arange(len(times), dtype=np.float64)
     if not np.isfinite(times).all():
         text, hint = "the thermal frames state no times", "give --times or --fps, and --clock-offset"
         raise ScanError(text, place=frames.places[0], hint=hint)
     if times_s is not None:
         camera = replace(camera, time_offset_s=0.0)
     stream = make_stream(times, frames.load, frames.places, place=frames.places[0], kind="thermal")
-    _check_common_time(scan, times + camera.time_offset_s, frames.places[0])
+    if not free:
+        _check_common_time(scan, times + camera.time_offset_s, frames.places[0])
     own, told = scan.environment, frames.environment
     room = {k: getattr(told, k) for k, v in vars(own).items() if v is None and getattr(told, k) is not None}
     notes = [*scan.notes, *frames.notes, f"thermal frames joined by {path.name}"]

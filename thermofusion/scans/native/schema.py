@@ -84,6 +84,7 @@ class ThermalCameraDoc(CameraDoc):
     netd_K: float = Field(0.05, ge=0.0001, le=5)
     time_offset_s: float = Field(0.0, ge=-1e11, le=1e11)  # s: clocks may begin anywhere
     psf_sigma_px: float | None = Field(None, ge=0.01, le=20)
+    mount: Literal["rig", "free"] = "rig"  # free: held by itself, or on a stand; it has no extrinsic
 
 
 class CamerasDoc(Border):
@@ -244,10 +245,11 @@ def thermal_camera_of(doc: ThermalCameraDoc, extrinsics: ExtrinsicsDoc, path: Pa
     if not (lo >= 1 and lo + MIN_BAND_UM <= hi <= 30):
         text = f"expected two wavelengths in 1-30 um that rise by at least {MIN_BAND_UM} um, got {lo}, {hi}"
         raise ScanError(f"key 'cameras.thermal.band_um': {text}", place=path)
-    lens, T = camera_of(doc, "cameras.thermal", path), _extrinsic(extrinsics, "thermal", path)
+    lens = camera_of(doc, "cameras.thermal", path)
+    T = np.eye(4) if doc.mount == "free" else _extrinsic(extrinsics, "thermal", path)
     signal = SignalCurve() if doc.signal is None else signal_of(doc.signal, path)
     try:
-        return ThermalCamera(lens, T, signal, doc.band_um, doc.netd_K, doc.time_offset_s, doc.psf_sigma_px)
+        return ThermalCamera(lens, T, signal, doc.band_um, doc.netd_K, doc.time_offset_s, doc.psf_sigma_px, doc.mount)
     except ValueError as e:
         raise ScanError(str(e), place=f"{path}: key 'extrinsics'") from None
 

@@ -66,7 +66,8 @@ def scan_json(scan: Scan) -> dict[str, Any]:
         extrinsics["T_color_depth"] = rig.T_color_depth.tolist()
     if scan.thermal is not None:
         cameras["thermal"] = {**_camera(scan.thermal.camera.lens), **_radiometry(scan.thermal.camera)}
-        extrinsics["T_thermal_depth"] = scan.thermal.camera.T_thermal_depth.tolist()
+        if scan.thermal.camera.mount == "rig":
+            extrinsics["T_thermal_depth"] = scan.thermal.camera.T_thermal_depth.tolist()
     environment = {k: v for k, v in vars(scan.environment).items() if v is not None}
     return {
         "schema": SCHEMA,
@@ -104,6 +105,7 @@ def _radiometry(camera: ThermalCamera) -> dict[str, Any]:
         "netd_K": camera.netd_K,
         "time_offset_s": camera.time_offset_s,
         **({} if camera.psf_sigma_px is None else {"psf_sigma_px": camera.psf_sigma_px}),
+        **({} if camera.mount == "rig" else {"mount": camera.mount}),
     }
 
 
