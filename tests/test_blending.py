@@ -16,7 +16,7 @@ from thermofusion.temperature import blend as blending
 from thermofusion.temperature import crosscal
 from thermofusion.temperature.blend import blend
 from thermofusion.temperature.problem import remove_air_path
-from thermofusion.temperature.surroundings import Room
+from thermofusion.temperature.room.stated import Room
 from thermofusion.temperature.uncertainty import (
     BILINEAR_VARIANCE,
     AngleTables,

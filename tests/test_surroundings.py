@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermofusion.temperature.surroundings import SurroundingsResult, surroundings
+from thermofusion.temperature.room.surroundings import SurroundingsResult, surroundings
 from thermofusion.types import SurfaceMesh
 
 TINY_OFFSET_M = 1e-4  # analytic form factors are those of the surface itself

@@ -23,7 +23,7 @@ from thermofusion.recipe import load_recipe
 from thermofusion.robust import Statistics, mad_sigma, weighted_quantile
 from thermofusion.scans import open_scan
 from thermofusion.temperature.references import ExpectedReading
-from thermofusion.temperature.surroundings import Room
+from thermofusion.temperature.room.stated import Room
 from thermofusion.temperature.uncertainty import BILINEAR_VARIANCE
 from thermofusion.types import SurfaceMesh
 

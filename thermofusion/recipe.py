@@ -197,6 +197,12 @@ class TemperatureSection(_Section):
     sigma_reflected_K: float = Field(
         0.5, ge=0, le=100, description="of the reflected temperature, measured with crumpled foil"
     )
+    sigma_room_K: float = Field(
+        2.0,
+        ge=0,
+        le=100,
+        description="half the difference between opposite walls, where nothing shows it",
+    )
     sigma_normal_deg: float | None = Field(
         None, ge=0, le=45, description="of surface normals; None = estimated from depth noise and window"
     )

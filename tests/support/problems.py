@@ -8,7 +8,7 @@ from support.synthetic_views import BAND, HEIGHT, L_ROOM, REFLECTED_K, WIDTH
 from thermofusion.physics.emissivity import Fresnel
 from thermofusion.recipe import MappingSection, TemperatureSection
 from thermofusion.temperature.problem import ThermalProblem
-from thermofusion.temperature.surroundings import Room
+from thermofusion.temperature.room.stated import Room
 from thermofusion.temperature.uncertainty import ErrorModel
 from thermofusion.types import Camera
 

@@ -37,6 +37,7 @@ from ..types import (
     Trajectory,
     brief,
 )
+from .background import Background, find_background
 from .motion import MotionResult, view_corrections
 from .pixels import bad_pixels
 from .references import BlackbodyReading, read_blackbodies
@@ -93,6 +94,7 @@ class Mapped:
     outline_px : what the rig's alignment left between the outlines of model and image, NaN = not measured.
     jitter_s : one sigma of what single thermal frames' stamps lacked and was put right. depth_scale : depth over truth
     less 1, as outlines ask for it, 0 = no news.
+    background : what the views show of the room; None in results of earlier versions.
     """
 
     views: ThermalViews
@@ -104,6 +106,7 @@ class Mapped:
     outline_px: float = float("nan")
     jitter_s: float = 0.0
     depth_scale: float = 0.0
+    background: Background | None = None
 
     __repr__ = brief
 
@@ -139,9 +142,9 @@ def observe(
     observations = observe_views(stream, SurfaceRays(surface), views, converter, mapping, progress=progress)
     blackbodies = read_blackbodies(stream, views, scan.references, converter)
     uv = np.argwhere(bad)[:, ::-1].astype(np.int32)
-    return Mapped(
-        views, left_out, observations, blackbodies, motion, uv, rig.residual_px_after, rig.jitter_s, rig.depth_scale
-    )
+    background = find_background(stream, surface, views, converter, scan.references)
+    left = rig.residual_px_after, rig.jitter_s, rig.depth_scale
+    return Mapped(views, left_out, observations, blackbodies, motion, uv, *left, background)
 
 
 def observe_views(

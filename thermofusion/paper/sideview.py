@@ -16,7 +16,7 @@ from ..physics.band import ZERO_DEGC_K, Band
 from ..physics.emissivity import EmissivityModel, model_from_recipe
 from ..recipe import Recipe
 from ..robust import SIGMA_PER_MAD
-from ..temperature.surroundings import room_of
+from ..temperature.room.stated import room_of
 from ..types import Float, Observations, Scan
 from .models import SKIN, by_radiance_degC, eqs25_27_degC
 

@@ -22,6 +22,7 @@ OLD_NAMES = MappingProxyType(
 @cache
 def stored() -> MappingProxyType[str, type]:
     """Name and version -> class. A class whose fields change gets a new version; the old one stays, with its reader."""
+    from ..mapping.background import Background
     from ..mapping.motion import MotionResult
     from ..mapping.observe import Mapped
     from ..mapping.references import BlackbodyReading
@@ -30,6 +31,7 @@ def stored() -> MappingProxyType[str, type]:
     from ..surface.clean import RemovedPart
     from ..surface.surface import SurfaceResult
     from ..temperature.crosscal import Calibration
+    from ..temperature.room.map import RoomMap
     from ..temperature.sensor.field import ImageField
     from ..temperature.sensor.pattern import Pattern
     from ..temperature.solve import Temperature
@@ -48,6 +50,7 @@ def stored() -> MappingProxyType[str, type]:
 
     return MappingProxyType(
         {
+            "background/1": Background,
             "blackbody-reading/1": BlackbodyReading,
             "calibration/1": Calibration,
             "camera/1": Camera,
@@ -60,6 +63,7 @@ def stored() -> MappingProxyType[str, type]:
             "removed-part/1": RemovedPart,
             "rig/1": RigResult,
             "shared-errors/1": SharedErrors,
+            "room-map/1": RoomMap,
             "sensor-pattern/1": Pattern,
             "signal-curve/1": SignalCurve,
             "surface-mesh/1": SurfaceMesh,

@@ -22,8 +22,8 @@ from ..types import Bool, Float, Float32, Int, Observations, OutputMode
 from .crosscal import Calibration
 from .mean import Groups, RobustMean, Solved
 from .problem import ThermalProblem
+from .room.stated import Room
 from .sensor.criticism import patches
-from .surroundings import Room
 from .uncertainty import (
     AngleTables,
     Budget,
@@ -203,7 +203,7 @@ def _blend(rows: Observations, groups: Groups, problem: ThermalProblem, task: _T
         columns["spread_K"] = spread / task.slope_L
         columns["own_K2"] = mean.own_variance(solved, rows.view // BLOCK_VIEWS) / (task.slope_L * task.epsilon0) ** 2
         if task.with_uncertainty:
-            levers = _levers(rows, mean, solved, task, errors)
+            levers = _levers(rows, mean, solved, task, errors, problem.room_errors(groups.vertex))
             parts, common, modes = _errors_of(levers, x, band.temperature_K(L_s), columns, task, errors)
     columns |= {"absolute_K": band.temperature_K(L_s), "normal_equivalent_K": band.temperature_K(L0)}
     return _Block(groups.vertex, columns, parts, common, modes)
@@ -219,7 +219,6 @@ def _errors_of(
         epsilon0=task.epsilon0,
         absolute=task.settings.output == "absolute" and task.angle_corrected,
         slope_L=task.slope_L,
-        slope_reflected=float(task.band.d_radiance_dT(task.room.reflected_K)),
         shape_fitted=fitted,
         epsilon0_follows=fitted and follows_shape(task.given),
         level_sigma_K=calibration.level_sigma_K if calibration else np.nan,
@@ -362,8 +361,10 @@ def _robust_mean(rows: Observations, groups: Groups, L_r: Float, task: _Task, er
     return RobustMean(groups, np.asarray(y), E, weight, statistical)
 
 
-def _levers(rows: Observations, mean: RobustMean, solved: Solved, task: _Task, errors: ErrorModel) -> Levers:
-    """Σ over each vertex's rows of h times what an error does to a row, h = wE/ΣwE²."""
+def _levers(
+    rows: Observations, mean: RobustMean, solved: Solved, task: _Task, errors: ErrorModel, room: Float
+) -> Levers:
+    """Σ over each vertex's rows of h times what an error does to a row, h = wE/ΣwE²; room : (G, R), see `Levers`."""
     groups, one = mean.groups, np.ones(len(rows), np.float32)
     h = (solved.weight * mean.E / groups.rows(mean.denominator(solved.weight))).astype(np.float32)
     slope = task.tables.slope(rows.cos_angle) if task.angle_corrected else 0 * one
@@ -376,4 +377,4 @@ def _levers(rows: Observations, mean: RobustMean, solved: Solved, task: _Task, e
         modes = groups.weighted_sums(
             h, task.calibration.error_modes(MODES)(rows, groups.rows(solved.x.astype(np.float32)))
         )
-    return Levers(squares[:, 0], sums[:, 0], sums[:, 1], sums[:, 2], squares[:, 1], sums[:, 3], sums[:, 4], modes)
+    return Levers(squares[:, 0], sums[:, 0], sums[:, 1], sums[:, 2], squares[:, 1], sums[:, 3], sums[:, 4], modes, room)

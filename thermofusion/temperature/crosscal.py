@@ -160,6 +160,18 @@ class Overlap:
         """Solved; see `_settled`. Raises ScanError."""
         return cls(problem, *_settled(problem))
 
+    def lit_again(self, problem: ThermalProblem) -> Overlap:
+        """The same rows where other light meets the vertices, from the solution that is there."""
+        L_r = problem.L_reflected[self.rows.vertex]
+        change = L_r - self.problem.L_reflected[self.rows.vertex]
+        system = replace(
+            self.system,
+            y=self.system.y - change,
+            gain_column=self.system.gain_column + (change if self.system.use_gain else 0.0),
+            readings=problem.blackbodies,
+        )
+        return replace(self, problem=problem, system=system, solution=system.solve(self.solution))
+
     def plain(self) -> Calibration:
         """Without a pattern of the sensor."""
         return _result(self, None)

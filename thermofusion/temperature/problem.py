@@ -7,16 +7,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.camera import pixel_rays
 from ..geometry.mesh import edge_gradient
 from ..mapping.observe import Mapped, clear_of_silhouettes
 from ..physics.band import Band
 from ..physics.emissivity import EmissivityModel, model_from_recipe
 from ..physics.equation import leaving_radiance
 from ..recipe import MappingSection, TemperatureSection
-from ..types import Bool, Camera, Float, Float32, Int, Observations, Scan, SurfaceMesh
+from ..types import Bool, Camera, Float, Float32, Int, Observations, Scan, SurfaceMesh, ThermalViews
 from .references import ContactReading, ExpectedReading, contact_readings, expected_readings
-from .surroundings import Room, SurroundingsResult, room_of, surroundings
+from .room.harmonics import open_transfer
+from .room.map import RoomMap, RoomPrior
+from .room.stated import ASSUMED_SIGMA_K, Room, room_of
+from .room.surroundings import SurroundingsResult, surroundings
 from .uncertainty import ErrorModel
+
+CAMERA_LEVEL_K = 2.0  # of an uncooled camera's own scale: data sheets say 2 K
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +37,8 @@ class ThermalProblem:
     L_reflected : (V,) that vertices are lit by. around : what they see of the body; None where that is switched off, or
     vertices are a sample. errors : one-sigma parts of an observation. blackbodies, contacts : what sets the level.
     vertices_per_patch : vertices that share a normal's error. other : (V,) what is not skin, None = not asked.
+    room_map : radiance of the room from each direction; None: even, as stated. transfer : (V, 9) how its harmonics
+    light a vertex. uneven : (V,) what the room adds to what vertices reflect, beyond its mean.
     """
 
     vertices: NDArray[np.intp]
@@ -54,6 +62,9 @@ class ThermalProblem:
     mapping: MappingSection
     settings: TemperatureSection
     other: Bool | None = None
+    room_map: RoomMap | None = None
+    transfer: Float32 | None = None
+    uneven: Float | None = None
 
     @classmethod
     def of(
@@ -77,6 +88,7 @@ class ThermalProblem:
         rows = remove_air_path(mapped.observations, settings.transmission_per_m, L_air)
         clear, counts = clear_of_silhouettes(rows, len(surface), mapping.silhouette_px)
         rows, clear = rows.select(counts), clear[counts]
+        around = surroundings(surface) if settings.crosscal.surroundings else None
         straight = rows.cos_angle >= np.float32(np.cos(np.radians(mapping.max_angle_deg)))
         straight_seen = np.bincount(rows.vertex[straight], minlength=len(surface)) > 0
         problem = cls(
@@ -93,13 +105,15 @@ class ThermalProblem:
             emissivity=model_from_recipe(settings.emissivity, band),
             room=room,
             L_reflected=np.full(len(surface), L_room),
-            around=surroundings(surface) if settings.crosscal.surroundings else None,
+            around=around,
             errors=ErrorModel.of(camera, settings).aligned(mapped.outline_px, mapped.depth_scale),
             blackbodies=expected_readings(mapped.blackbodies, scan.references, band, L_room),
             contacts=contact_readings(scan.references, surface, band, scan.root),
             vertices_per_patch=vertices_per_patch(surface, normal_window_m),
             mapping=mapping,
             settings=settings,
+            room_map=RoomMap.unseen(_room_prior(room, settings, band)),
+            transfer=open_transfer(surface.normals).astype(np.float32) if around is None else around.transfer,
         )
         return problem.lit_by(np.full(len(surface), np.median(rows.radiance), np.float32))
 
@@ -117,7 +131,50 @@ class ThermalProblem:
             return self
         L_room = float(self.band.radiance(self.room.reflected_K))
         lit = self.around.reflected_radiance(L_room, L_skin, emissivity=self.emissivity.hemispherical)
-        return replace(self, L_reflected=lit)
+        return replace(self, L_reflected=lit if self.uneven is None else lit + self.uneven)
+
+    @property
+    def room_prior(self) -> RoomPrior:
+        """What is known of the room beforehand: as stated; on the camera's own scale where no reference sets it."""
+        prior = _room_prior(self.room, self.settings, self.band)
+        anchored = self.blackbodies or self.contacts
+        return prior if anchored else replace(prior, sigma_K=float(np.hypot(prior.sigma_K, CAMERA_LEVEL_K)))
+
+    def in_room(self, found: RoomMap, views: ThermalViews) -> ThermalProblem:
+        """In a room as it was seen, and what blackbodies reflect of it. views : all, for their poses."""
+        assert self.transfer is not None
+        L_room = float(found.coefficients[0])
+        uneven = self.transfer[:, 1:].astype(np.float64) @ found.coefficients[1:]
+        if self.around is not None:
+            uneven += self.around.from_cells(found.cells)
+        before = float(self.band.radiance(self.room.reflected_K))
+        lit = self.L_reflected + uneven - (0.0 if self.uneven is None else self.uneven)
+        lit += self.transfer[:, 0] * (L_room - before)
+        room = replace(self.room, reflected_K=float(self.band.temperature_K(L_room)), measured=found.measured)
+        return replace(
+            self,
+            room=room,
+            room_map=found,
+            uneven=uneven,
+            L_reflected=lit,
+            blackbodies=tuple(self._lit_source(b, found, views, before) for b in self.blackbodies),
+        )
+
+    def _lit_source(
+        self, reading: ExpectedReading, found: RoomMap, views: ThermalViews, before: float
+    ) -> ExpectedReading:
+        """A blackbody turned toward the camera, lit by the room behind it."""
+        ray = pixel_rays(self.lens, np.array([reading.u_px]), np.array([reading.v_px]))[0]
+        toward_camera = -views.T_world_thermal[reading.view, :3, :3] @ ray
+        change = reading.reflectivity * (found.facing(toward_camera) - before)
+        return replace(reading, expected=reading.expected + change)
+
+    def room_errors(self, vertices: NDArray) -> Float:
+        """(N, R) what one sigma of each error of the room adds to the light that meets some vertices, W m-2 sr-1."""
+        if self.room_map is None or self.transfer is None:
+            slope = float(self.band.d_radiance_dT(self.room.reflected_K))
+            return np.full((len(vertices), 1), self.errors.sigma_reflected_K * slope)
+        return np.asarray(self.transfer[vertices].astype(np.float64) @ self.room_map.modes)
 
     def informed(self, surface: SurfaceMesh, T_K: Float) -> ThermalProblem:
         """With what a first map (V,) K tells: the body's own radiation, the temperature's slope along the skin."""
@@ -161,11 +218,19 @@ class ThermalProblem:
             clear=self.clear[mine],
             counts=self.counts[mine],
             L_reflected=self.L_reflected[chosen],
+            transfer=None if self.transfer is None else self.transfer[chosen],
+            uneven=None if self.uneven is None else self.uneven[chosen],
             around=None,
             errors=replace(self.errors, gradient_K_per_m=gradient[chosen]),
             contacts=tuple(c for c in contacts if len(c.vertices)),
             vertices_per_patch=self.vertices_per_patch * len(chosen) / len(self),
         )
+
+
+def _room_prior(room: Room, settings: TemperatureSection, band: Band) -> RoomPrior:
+    sigma_K = max(settings.sigma_reflected_K, ASSUMED_SIGMA_K) if room.assumed else settings.sigma_reflected_K
+    L, slope = float(band.radiance(room.reflected_K)), float(band.d_radiance_dT(room.reflected_K))
+    return RoomPrior(L, slope, sigma_K, settings.sigma_room_K)
 
 
 def _restarts(usable: Bool, frame: Int) -> tuple[int, ...]:

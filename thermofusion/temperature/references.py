@@ -21,11 +21,12 @@ CONTACT_FAR_M = 0.03  # a spot farther off the surface is a mistake
 class ExpectedReading(BlackbodyReading):
     """A blackbody's reading, and what it should have been: in-band radiance, W m-2 sr-1.
 
-    sigma_expected : one sigma of the source's temperature, common to all its readings.
+    sigma_expected : one sigma of the source's temperature, common to all its readings. reflectivity : 1 - ε of it.
     """
 
     expected: float
     sigma_expected: float
+    reflectivity: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +49,8 @@ def expected_readings(
         T_K = source.degC + ZERO_DEGC_K
         expected = float(apparent_radiance(band.radiance(T_K), source.emissivity, L_room))
         sigma = source.emissivity * float(band.d_radiance_dT(T_K)) * source.uncertainty_K
-        out.append(ExpectedReading(**vars(reading), expected=expected, sigma_expected=sigma))
+        lost = 1 - source.emissivity
+        out.append(ExpectedReading(**vars(reading), expected=expected, sigma_expected=sigma, reflectivity=lost))
     return tuple(out)
 
 

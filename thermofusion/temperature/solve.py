@@ -21,8 +21,11 @@ from ..types import Bool, Float32, OutputMode, Scan, SharedErrors, SurfaceMesh, 
 from .blend import BlendResult, blend
 from .crosscal import Calibration, Overlap
 from .problem import ThermalProblem
+from .room.map import RoomMap
+from .room.stated import Room
+from .room.survey import survey
+from .room.witness import sides_of
 from .skin import not_skin
-from .surroundings import Room
 
 Sections = tuple[MappingSection, TemperatureSection]
 METHODS = ("nearest-view", "mean", "cos-resolution", "paper", "corrected-cos", "joint")
@@ -40,6 +43,7 @@ class Temperature:
     body_fraction : (V,) F, or None. level_sigma_K : one sigma of the level common to all vertices, by part; a single
     vertex's absolute interval is √(uncertainty² + Σ level²). crosscal : for the report; methods : of old results.
     shared : what errors of vertices have in common; None where nothing tells (version 0.1.0 wrote the result, say).
+    room : its radiance by direction, as it was used.
     """
 
     mesh: ThermalMesh
@@ -53,6 +57,7 @@ class Temperature:
     methods: dict[str, Any] = field(default_factory=dict)
     messages: tuple[str, ...] = ()
     shared: SharedErrors | None = None
+    room: RoomMap | None = None
 
     __repr__ = brief
 
@@ -95,7 +100,7 @@ def solve(
     """
     problem = ThermalProblem.of(scan, mesh, normal_window_m, mapped, mapping, temperature)
     progress("temperature", 1, 4)
-    calibration, notes, other, first = calibrated(problem)
+    problem, calibration, notes, other, first = calibrated(problem, mapped)
     problem = problem.without(other) if other.any() else problem
     progress("temperature", 2, 4)
     problem = problem.informed(mesh, first.absolute_K)
@@ -114,6 +119,7 @@ def solve(
         crosscal={} if calibration is None else _crosscal_report(calibration, mapped, problem, result),
         messages=(*problem.room.assumed, *notes),
         shared=_shared(result, problem.lens.focal_px, normal_window_m),
+        room=problem.room_map,
     )
 
 
@@ -125,18 +131,26 @@ def _shared(result: BlendResult, focal_px: float, normal_window_m: float) -> Sha
     return SharedErrors.of(effects, focal_px, normal_window_m)
 
 
-def calibrated(problem: ThermalProblem) -> tuple[Calibration | None, tuple[str, ...], Bool, BlendResult]:
-    """The cross-calibration and its messages, or None and why there is none; which vertices (V,) are not skin; a first
-    map, without uncertainty.
+def calibrated(
+    problem: ThermalProblem, mapped: Mapped
+) -> tuple[ThermalProblem, Calibration | None, tuple[str, ...], Bool, BlendResult]:
+    """The problem in the room as it was seen; the cross-calibration and its messages, or None and why there is none;
+    which vertices (V,) are not skin; a first map, without uncertainty.
 
     What is not skin takes no part in the calibration.
     """
     if problem.settings.method != "joint" or problem.n_views < 2:
         alone = "one thermal view cannot be cross-calibrated: the camera's offset stays in the result"
         first = blend(problem, None, with_uncertainty=False)
-        return None, (alone,) if problem.settings.method == "joint" else (), np.zeros(len(problem), bool), first
+        notes = (alone,) if problem.settings.method == "joint" else ()
+        return problem, None, notes, np.zeros(len(problem), bool), first
     overlap = Overlap.of(problem)
     plain = overlap.plain()
+    if mapped.background is not None:
+        room = survey(mapped.background, plain, problem.room_prior, problem.errors.netd_K)
+        problem = problem.in_room(room.with_sides(*sides_of(overlap)), mapped.views)
+        overlap = overlap.lit_again(problem)
+        plain = overlap.plain()
     first = blend(problem, plain, with_uncertainty=False)
     other = not_skin(problem, plain, first)
     if other.any():
@@ -145,7 +159,7 @@ def calibrated(problem: ThermalProblem) -> tuple[Calibration | None, tuple[str, 
     calibration = overlap.refined()
     if other.any() or calibration.sensor is not None:  # else the plain one says the same
         first = blend(problem, calibration, with_uncertainty=False)
-    return calibration, calibration.messages, other, first
+    return problem, calibration, calibration.messages, other, first
 
 
 def unmeasured(surface: SurfaceMesh, temperature: TemperatureSection) -> Temperature:

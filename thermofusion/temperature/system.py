@@ -7,6 +7,7 @@ The unknowns of vertices are eliminated analytically, so that what is solved has
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,6 @@ from ..types import Bool, Float, Int
 from .layout import Layout
 from .references import ExpectedReading
 from .sensor.field import ImageField
-from .sensor.pattern import Pattern
 
 HUBER_STEPS, TUKEY_STEPS = 4, 40
 CONVERGED_K = 1e-4  # a hundredth of what any result is good to
@@ -32,6 +32,18 @@ SHAPE_BOUNDS = (-2.0, 5.0)
 GAIN_PRIOR = 0.1
 READING_HALF_PX = 8.0  # of a source in the image: single columns of the sensor average out over it
 READING_FLOOR_K = 0.01  # what a field of low order leaves at a reference's place
+
+
+class Columns(Protocol):
+    """Further linear terms of what is read: a sensor's pattern, say."""
+
+    def columns(self, u_px: NDArray, v_px: NDArray, view: NDArray) -> csr_matrix:
+        """(N, Q) derivatives of what is read at pixels u_px, v_px (N,) of views (N,)."""
+        ...
+
+    def precision(self) -> Float:
+        """(Q, Q) prior inverse covariance of the coefficients, K-2."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +130,7 @@ class OverlapSystem:
     contacts: tuple[ContactRow, ...]
     reading_places: tuple[KnownField, ...] = ()
     correlated: float = 1.0
-    sensor: Pattern | None = None
+    sensor: Columns | None = None
     sensor_columns: csr_matrix | None = None  # (N, Q) of it
 
     @property
@@ -141,7 +153,7 @@ class OverlapSystem:
         patterns = np.ascontiguousarray(self.patterns @ (self.keep.T @ keep))
         return replace(self, keep=keep, patterns=patterns, use_shape=use_shape)
 
-    def with_sensor(self, sensor: Pattern, u_px: NDArray, v_px: NDArray) -> OverlapSystem:
+    def with_sensor(self, sensor: Columns, u_px: NDArray, v_px: NDArray) -> OverlapSystem:
         """The system with a sensor's pattern, at the rows' pixels u_px, v_px (N,)."""
         return replace(self, sensor=sensor, sensor_columns=sensor.columns(u_px, v_px, self.group))
 

@@ -186,20 +186,22 @@ class Uncertainty:
         """From parts_K of single vertices, signed effects common_K (V,) of common errors, and modes_K (V, R)."""
         parts = {name: np.asarray(value, np.float32) for name, value in parts_K.items()}
         common = {name: np.asarray(value, np.float32) for name, value in common_K.items()}
-        level = {}
+        level: dict[str, float] = {}
         for name, effect in common.items():
-            known = effect[np.isfinite(effect)]
-            level[name] = float(np.median(known)) if len(known) else 0.0
+            cause, known = cause_of(name), effect[np.isfinite(effect)]
+            middle = float(np.median(known)) if len(known) else 0.0
+            level[cause] = float(np.hypot(level.get(cause, 0.0), middle))
             if len(known) and np.ptp(known) > 0:
-                parts[name] = np.abs(effect - np.float32(level[name]))
+                off = np.abs(effect - np.float32(middle))
+                parts[cause] = np.hypot(parts[cause], off) if cause in parts else off
         total = np.sqrt(np.sum([p.astype(np.float64) ** 2 for p in parts.values()], axis=0))
-        level = {k: abs(v) for k, v in level.items()}
         return cls(total.astype(np.float32), parts, level, common, np.asarray(modes_K, np.float32))
 
     @property
     def absolute_K(self) -> Float32:
         """(V,) one sigma of a vertex's temperature on an absolute scale: its parts, and all of what is common."""
-        own = {name: value for name, value in self.parts_K.items() if name not in self.common_K}
+        causes = {cause_of(name) for name in self.common_K}
+        own = {name: value for name, value in self.parts_K.items() if name not in causes}
         squares = [v.astype(np.float64) ** 2 for v in (*own.values(), *self.common_K.values())]
         return np.sqrt(np.sum(squares, axis=0)).astype(np.float32)
 
@@ -215,7 +217,8 @@ class Levers:
 
     All sums run over a vertex's rows, (V,). squared : Σh². total : Σh. loss : Σ h(1-E). slope, slope_squared : Σ h|E'|
     and Σ (hE')². registration_m : Σ h·m. silhouette : Σ h·share of the room. modes : (V, R) effect of each mode of the
-    calibration's covariance.
+    calibration's covariance. room : (V, R) what one sigma of each error of the room adds to the light that meets the
+    vertex, W m-2 sr-1.
     """
 
     squared: Float
@@ -226,14 +229,15 @@ class Levers:
     registration_m: Float
     silhouette: Float
     modes: Float
+    room: Float
 
 
 @dataclass(frozen=True, eq=False)
 class Budget:
     """What the errors of all vertices have in common.
 
-    epsilon0 : 1 where nothing is corrected. absolute : the output is divided by ε(0), else normal-equivalent. slope_L,
-    slope_reflected : dL/dT at skin's and at the room's temperature, W m-2 sr-1 K-1. shape_fitted : ε(θ)'s shape was
+    epsilon0 : 1 where nothing is corrected. absolute : the output is divided by ε(0), else normal-equivalent. slope_L :
+    dL/dT at skin's temperature, W m-2 sr-1 K-1. shape_fitted : ε(θ)'s shape was
     solved for; epsilon0_follows : ε(0) with it. level_sigma_K : of the common level, NaN without a reference.
     sigma_normal_deg : as the residuals show it. registration_over : the alignment's own residual over the stated one.
     pattern_K : of what residuals still have in common by place in the image. gain_pivot_K : where an error of the gain
@@ -244,7 +248,6 @@ class Budget:
     epsilon0: float
     absolute: bool
     slope_L: float
-    slope_reflected: float
     shape_fitted: bool
     epsilon0_follows: bool
     level_sigma_K: float
@@ -303,11 +306,17 @@ def vertex_uncertainty(
     common = {
         "reference": zero + np.nan_to_num(b.level_sigma_K) / b.divisor,
         "emissivity0": scale * x / b.epsilon0 * sigma_epsilon0 if b.absolute else zero,
-        "reflected": reflected * errors.sigma_reflected_K * b.slope_reflected / b.slope_L,
     }
+    for i, lit in enumerate(levers.room.T, 1):
+        common[f"reflected {i}" if levers.room.shape[1] > 1 else "reflected"] = reflected * lit / b.slope_L
     if b.gain_pivot_K is not None:
         common["gain"] = errors.sigma_gain * (T_K - b.gain_pivot_K)
     return parts, common, modes
+
+
+def cause_of(name: str) -> str:
+    """The part of the budget that a shared error belongs to: "reflected 3" is one of the errors of "reflected"."""
+    return name.split()[0]
 
 
 def covariance_modes(covariance: Float, count: int) -> Float:

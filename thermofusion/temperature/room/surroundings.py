@@ -1,4 +1,4 @@
-"""The room round the subject, and what each vertex sees in reflection: that room, or the body itself (armpit, groin).
+"""What each vertex sees in reflection: the room, direction by direction, or the body itself (armpit, groin).
 
 Skin reflects diffusely at 10 µm, so the radiance L_r that reaches the camera by reflection is a cosine-weighted mean
 over the hemisphere above the vertex, L_r = (1 - F) L_room + F L_body, F the share that the body fills. Rays cast on the
@@ -19,45 +19,16 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from ..geometry.rays import Hits, RayScene, barycentric
-from ..physics.band import ZERO_DEGC_K
-from ..recipe import TemperatureSection
-from ..types import Bool, Environment, Float, Float32, SurfaceMesh
+from ...geometry.rays import Hits, RayScene, barycentric
+from ...types import Bool, Float, Float32, SurfaceMesh
+from .cells import cell_of
+from .harmonics import harmonics, open_transfer
 
-DEFAULT_ROOM_DEGC = 23.0  # taken, and said, where neither scan nor recipe knows the reflected temperature
 SAMPLE_SPACING_M = 0.020  # of the vertices rays start from: F changes over centimetres
 DIRECTIONS = 96  # per sample: F to about 0.01, which is 3 mK on skin in a room 10 K colder
 OFFSET_M = 0.010  # rays start this far above the surface: beyond the mesh's noise (2-4 mm) with room to spare
 NEIGHBOURS = 4
 NORMAL_SCALE_M = 0.05  # opposite sides of a thin part are 2 x this apart when samples are interpolated
-
-
-@dataclass(frozen=True)
-class Room:
-    """Temperatures of what surrounds the subject, K, and what had to be assumed of them; air None: not budgeted."""
-
-    reflected_K: float
-    air_K: float | None
-    assumed: tuple[str, ...] = ()
-
-    def text(self) -> str:
-        """In a few words, for pictures."""
-        reflected = f"room {self.reflected_K - ZERO_DEGC_K:.1f} °C reflected{' (assumed)' if self.assumed else ''}"
-        return reflected if self.air_K is None else f"{reflected}, air {self.air_K - ZERO_DEGC_K:.1f} °C"
-
-
-def room_of(environment: Environment, settings: TemperatureSection) -> Room:
-    """Recipe over scan over the default; what had to be assumed is said."""
-    assumed = []
-    reflected = environment.reflected_degC if settings.reflected_degC is None else settings.reflected_degC
-    air = environment.air_degC if settings.air_degC is None else settings.air_degC
-    if reflected is None:
-        reflected = DEFAULT_ROOM_DEGC if air is None else air
-        assumed.append(
-            f"the reflected temperature is not known: {reflected:.1f} °C assumed (an error of 1 K costs 20 mK straight "
-            "on, 63 mK at 60°); measure it with crumpled foil"
-        )
-    return Room(reflected + ZERO_DEGC_K, (reflected if air is None else air) + ZERO_DEGC_K, tuple(assumed))
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,12 +40,17 @@ class SurroundingsResult:
         sum is that sample's F less what back faces (holes in the mesh) fill.
     interpolation : (V, M) sparse, rows sum to 1; `interpolation @ hits` is the whole V x V operator, never formed.
     sample_fraction : (M,) float32, F of the samples.
+    transfer : (V, 9) float32, how each spherical harmonic of the room lights a vertex: cosine-weighted over the
+        hemisphere, where the body leaves it free. escaped : (M, D) int16, the cell (`cells`) that each ray of a sample
+        escapes into, -1 = it meets the body.
     """
 
     body_fraction: Float32
     hits: csr_matrix
     interpolation: csr_matrix
     sample_fraction: Float32
+    transfer: Float32
+    escaped: NDArray[np.int16]
 
     def reflected_radiance(
         self, room: float, skin: NDArray, *, emissivity: float | NDArray = 1.0, bounces: int = 2
@@ -104,6 +80,11 @@ class SurroundingsResult:
             lit = room + self.interpolation @ (self.sample_fraction * (around - room))
         return lit
 
+    def from_cells(self, cells: NDArray) -> Float:
+        """(V,) cosine-weighted mean of what stands in the room's cells (N_CELLS,), where rays escape to it."""
+        padded = np.append(cells, 0.0)  # -1 is the body
+        return np.asarray(self.interpolation @ padded[self.escaped].mean(axis=1))
+
 
 def surroundings(
     mesh: SurfaceMesh,
@@ -132,7 +113,13 @@ def surroundings(
     shares = _hit_shares(mesh, hits, front, len(sample), directions)
     interpolation = _interpolation(mesh, sample)
     body_fraction = np.clip(interpolation @ fraction, 0, 1).astype(np.float32)
-    return SurroundingsResult(body_fraction, shares, interpolation, fraction)
+    free = hits.triangle < 0
+    escaped = np.where(free, cell_of(rays), -1).astype(np.int16).reshape(len(sample), directions)
+    seen = (harmonics(rays) * free[:, None]).reshape(len(sample), directions, -1).mean(axis=1)
+    # the body takes away little, and that varies slowly: interpolated is what it takes, exact is what would be without
+    taken = seen - open_transfer(mesh.normals[sample])
+    transfer = (open_transfer(mesh.normals) + interpolation @ taken).astype(np.float32)
+    return SurroundingsResult(body_fraction, shares, interpolation, fraction, transfer, escaped)
 
 
 def _sample_vertices(mesh: SurfaceMesh, spacing_m: float) -> NDArray[np.int64]:
