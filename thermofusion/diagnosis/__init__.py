@@ -1,5 +1,6 @@
 """What the data say against the model: named faults, their size, what was done, and what a user can do."""
 
-from .diagnose import VOCABULARY, Diagnosis, diagnose
+from .diagnose import VOCABULARY, diagnose
+from .words import Diagnosis
 
 __all__ = ["VOCABULARY", "Diagnosis", "diagnose"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
@@ -12,6 +12,8 @@ from ..temperature.crosscal import Calibration
 from ..temperature.sensor.pattern import Pattern
 from ..temperature.solve import Temperature
 from ..types import VertexFlag
+from .radiation import of_room
+from .words import Diagnosis
 
 OUTLINE_PX = 0.4  # clean scans leave 0.15-0.3 px between the outlines of model and image
 GRID = 24  # points along each side of the image at which a pattern's size is taken
@@ -23,6 +25,7 @@ VOCABULARY = MappingProxyType(
         "seconds, and keep the subject in the middle of the image",
         "fixed pattern": "let the camera make a two-point correction before a black surface, and clean its window",
         "readings agree by place in the image": "record more views in which the same skin crosses the whole image",
+        "reflected temperature stated wrong": "measure it with crumpled foil where the person stood, or leave it out",
         "surface that is not skin": "take off what can be taken off; its temperature is not the skin's",
         "dead pixels": "have the camera's list of bad pixels renewed",
         "depth scale is off": "measure something of known size with the depth camera, and the spacing of the cameras",
@@ -33,27 +36,6 @@ VOCABULARY = MappingProxyType(
 )
 
 
-@dataclass(frozen=True)
-class Diagnosis:
-    """One fault. size_K : its effect on readings, K, None where none is known. size : the fault's own, in `unit`."""
-
-    what: str
-    evidence: str
-    size_K: float | None
-    where: str
-    done: str
-    advice: str = ""
-    size: float | None = None
-    unit: str = ""
-
-    def line(self) -> str:
-        """For the terminal."""
-        sizes = [] if self.size is None else [f"{self.size:.3g} {self.unit}"]
-        sizes += [] if self.size_K is None else [f"{self.size_K:.2f} K"]
-        size = f" ({', '.join(sizes)})" if sizes else ""
-        return f"{self.what}{size}, {self.where}: {self.done}; {self.advice}"
-
-
 def diagnose(mapped: Mapped, temperature: Temperature, image_px: tuple[int, int]) -> tuple[Diagnosis, ...]:
     """What is wrong with a scan, as its own data say; empty for a clean one. image_px : width and height."""
     found: list[Diagnosis] = []
@@ -62,6 +44,7 @@ def diagnose(mapped: Mapped, temperature: Temperature, image_px: tuple[int, int]
         found += _patterns(calibration)
         found += _references(calibration)
     found += _skin(temperature)
+    found += of_room(temperature.room)
     found += _outlines(mapped)
     if len(mapped.bad_pixels):
         share = len(mapped.bad_pixels) / (image_px[0] * image_px[1])

@@ -65,6 +65,8 @@ class Bench:
         mesh = surface.mesh
         sections = recipe.mapping, recipe.temperature
         problem = ThermalProblem.of(scan, mesh, surface.normal_window_m, mapped, *sections)
+        if temperature.room is not None:
+            problem = problem.in_room(temperature.room, mapped.views)
         skin_K = temperature.absolute_degC.astype(np.float64) + ZERO_DEGC_K
         well_seen = np.bincount(rows.vertex[rows.cos_angle > WELL_SEEN_COS], minlength=len(mesh)) >= 2
         other = (temperature.mesh.flags & VertexFlag.NOT_SKIN) > 0

@@ -256,6 +256,7 @@ def _temperature(t: Temperature) -> dict[str, Any]:
         "level_sigma_K": t.level_sigma_K,
         "flags": flags,
         "crosscal": t.crosscal,
+        "room": {} if t.room is None else t.room.told(),
         "criticism": {} if t.calibration is None else t.calibration.criticism,
     }
 

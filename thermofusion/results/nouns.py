@@ -57,7 +57,8 @@ def stored() -> MappingProxyType[str, type]:
             "free-views/1": FreeViews,
             "image-field/1": ImageField,
             "lost-range/1": LostRange,
-            "mapped/1": Mapped,
+            "mapped/2": Mapped,
+            "mapped/1": Mapped,  # without `background`
             "motion/1": MotionResult,
             "observations/1": Observations,
             "removed-part/1": RemovedPart,
@@ -68,7 +69,8 @@ def stored() -> MappingProxyType[str, type]:
             "signal-curve/1": SignalCurve,
             "surface-mesh/1": SurfaceMesh,
             "surface/1": SurfaceResult,
-            "temperature/2": Temperature,
+            "temperature/3": Temperature,
+            "temperature/2": Temperature,  # without `room`
             "temperature/1": Temperature,  # without `shared`
             "thermal-camera/1": ThermalCamera,
             "thermal-mesh/2": ThermalMesh,

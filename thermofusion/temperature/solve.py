@@ -259,6 +259,7 @@ def compare_methods(
     recipe : the sections (mapping, temperature) that the temperatures were found with.
     """
     problem = ThermalProblem.of(scan, surface, normal_window_m, mapped, *recipe)
+    problem = problem if found.room is None else problem.in_room(found.room, mapped.views)
     problem = problem.informed(surface, found.absolute_degC.astype(np.float64) + ZERO_DEGC_K)
     out = {}
     for method in METHODS:

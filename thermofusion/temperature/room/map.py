@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,6 +90,18 @@ class RoomMap:
     def seen_share(self) -> float:
         """Of the sphere."""
         return float(cell_solid_angles()[self.seen].sum() / (4 * np.pi))
+
+    def told(self) -> dict[str, Any]:
+        """For the report, K: the mean and half the difference between opposite sides (world axes), with one sigma."""
+        a, sigma = self.coefficients / self.slope_L, np.sqrt(np.diag(self.covariance)) / self.slope_L
+        return {
+            "seen_share": self.seen_share,
+            "mean_differs_from_stated_K": self.difference_K,
+            "mean_sigma_K": float(sigma[0]),
+            "sides_K": a[1:4] / DIPOLE,
+            "sides_sigma_K": sigma[1:4] / DIPOLE,
+            "largest_cell_K": float(self.cells[np.argmax(np.abs(self.cells))] / self.slope_L),
+        }
 
     @property
     def modes(self) -> Float:
