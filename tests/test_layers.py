@@ -45,9 +45,10 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "judge": ALL,
     "calibration": (*BASE, "physics", "scans", "report"),
     "recording": (*BASE, "physics", "scans"),
+    "live": (*BASE, "physics", "depth", "scans", "tracking"),
     "phantom": (*NOUNS, "files", "geometry"),
     "paper": (*ALL, "judge", "phantom"),
-    "cli": (*ALL, "judge", "calibration", "recording", "phantom", "paper", "handover"),
+    "cli": (*ALL, "judge", "calibration", "recording", "live", "phantom", "paper", "handover"),
     "__init__": ALL,
     "__main__": ("cli", "errors"),
 }

@@ -87,6 +87,7 @@ def load(folder: Path, seconds: float) -> None:
     """Prints frames lost, cores used, memory over time."""
     shutil.rmtree(folder, ignore_errors=True)
     source(folder / "source", seconds)
+    os.sync()  # the disk is not still busy with it
     command = [sys.executable, "-m", "thermofusion", "record", "--from", str(folder / "source")]
     process = subprocess.Popen([*command, "-o", str(folder / "out"), "--json"], stdout=subprocess.PIPE, text=True)
     rows = []

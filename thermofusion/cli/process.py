@@ -28,6 +28,9 @@ def run(
     out: Annotated[Path, typer.Option("-o", "--out", help="Result folder.", callback=named)] = Path("out"),
     from_: Annotated[str | None, typer.Option("--from", help=f"Compute anew from this stage: {STAGES}.")] = None,
     until: Annotated[str | None, typer.Option("--until", help=f"Stop after this stage: {STAGES}.")] = None,
+    follow: Annotated[
+        bool, typer.Option("--follow", help="The scan is still being recorded: show the growing model first.")
+    ] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be computed, and why.")] = False,
     overwrite: Overwrite = False,
     json: Json = False,
@@ -36,7 +39,12 @@ def run(
     from .. import pipeline
 
     renamed: list[str] = []  # told last: before the work, errors speak
-    chosen, scan = processing.load(renamed.append), recording.open()
+    chosen = processing.load(renamed.append)
+    if follow:
+        from .live import followed
+
+        followed(recording.scan, chosen)
+    scan = recording.open()
     if dry_run:
         plans = pipeline.plan(scan, chosen, out, redo_from=from_)
         emit(plans, "\n".join(f"{p.name:<12} {'reuse' if p.reuse else 'compute'}  ({p.why})" for p in plans), json)

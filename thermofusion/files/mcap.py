@@ -257,6 +257,8 @@ class McapIndex:
     left_over: int = 0
     cut: tuple[int, int, int] | None = None
     damaged: list[int] = field(default_factory=list)
+    schemas: dict[int, str] = field(default_factory=dict)
+    whole: tuple[int, int] = (len(MAGIC), 0)  # behind the last whole record of the file itself: byte, messages
 
 
 def read_mcap_head(data: bytes) -> str | None:
@@ -273,18 +275,23 @@ def read_mcap_head(data: bytes) -> str | None:
         return None
 
 
-def scan_mcap(path: Path) -> McapIndex:
-    """Walk a file from its start to its end or tear. Raises ScanError: no MCAP, or compressed by another program."""
+def scan_mcap(path: Path, before: McapIndex | None = None) -> McapIndex:
+    """Walk a file from its start to its end or tear. before : what was found when it was shorter; it is continued.
+
+    Raises ScanError: no MCAP, or compressed by another program.
+    """
     with open_regular(path, "recording", limit_bytes=None) as f:
         size = f.seek(0, os.SEEK_END)
-        index = McapIndex(path)
+        index = before or McapIndex(path)
+        del index.messages[index.whole[1] :]
+        index.cut = None
         f.seek(0)
         library = read_mcap_head(f.read(4096))
         if library is None:
             raise ScanError("it is no MCAP recording, or its head is damaged", place=path, hint=COPY_AGAIN)
         index.library = library
         walk = _Walk(f, size, index)
-        walk.run(len(MAGIC))
+        walk.run(index.whole[0])
         index.torn_at = walk.good
         index.left_over = 0 if index.complete else size - walk.good
     return index
@@ -331,7 +338,7 @@ class _Walk:
 
     def __init__(self, file: BinaryIO, size: int, index: McapIndex) -> None:
         self._file, self._size, self._index = file, size, index
-        self._schemas: dict[int, str] = {}
+        self._schemas = index.schemas
         self.good = 0
 
     def run(self, at: int) -> None:
@@ -356,6 +363,7 @@ class _Walk:
             if end > self._size:
                 return
             at = self.good = end
+            self._index.whole = end, len(self._index.messages)
 
     def _read(self, length: int, at: int) -> bytes:
         self._file.seek(at)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from multiprocessing.context import BaseContext
 from typing import Any
 
-RING_BYTES = 64 * 2**20  # of a device: 1.4 s of the largest ones
+RING_BYTES = 128 * 2**20  # of a device: 4 s of a Kinect; a disk that others flush may stand still for 3 s
 MOST_WAITING = 400  # frames in the ring: what is said of them must fit the pipe beside it (64 KiB)
 
 

@@ -81,6 +81,17 @@ class GrowingSegment:
         self._velocity = np.zeros(6)  # twist per second
         self._append(frame, np.eye(4) if T is None else T, None, np.eye(4))
 
+    @property
+    def pose(self) -> Float:
+        """(4, 4) of the last frame, in the segment's own frame, m."""
+        return self._T[-1]
+
+    @property
+    def residual_mm(self) -> float:
+        """Median residual of the steps so far, mm at 1 m; NaN before the second frame."""
+        steps = [r for r in self._residual if r == r]
+        return float(np.median(steps)) if steps else float("nan")
+
     def take(self, frame: TrackingFrame, *, timed: bool = True) -> bool:
         """Append a frame if the motion to it can be believed; timed : its time was recorded, so its speed counts."""
         if frame.index - self._frames[-1] > MAX_GAP_FRAMES:

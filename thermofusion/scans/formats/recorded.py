@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import zlib
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -27,6 +28,7 @@ from ...geometry.rigid import pose
 from ...types import Camera, Environment, Float, Scan, Stream, ThermalCamera
 from ..clock import ClockFit, fit_clock
 from ..common import Kind, as_thermal, make_camera, make_rig, make_stream
+from ..native.compose import with_rig
 from ..stated import NOTHING, Stated
 from .fakenect import NO_DEPTH_RAW, KinectDepth
 
@@ -62,11 +64,42 @@ def recognise(path: Path) -> bool:
 
 def read(path: Path, stated: Stated = NOTHING) -> Scan:
     """A recording as a scan; what was lost, and where, stands in its notes. Raises ScanError."""
-    file = path / FILE if path.is_dir() else path
-    index = scan_mcap(file)
+    return _scan_of(scan_mcap(path / FILE if path.is_dir() else path), path, stated, {})
+
+
+class Growing:
+    """A recording that is still being written. `scan` holds what it has; `complete` : it has its end."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._file = path, path / FILE if path.is_dir() else path
+        self._index: McapIndex | None = None
+        self._infos: dict[int, FrameInfo] = {}
+        self.scan: Scan | None = None
+        self.complete = False
+
+    def look(self) -> bool:
+        """Take up what is new; whether something is. Raises ScanError."""
+        if not self._file.is_file():
+            return False
+        before = 0 if self._index is None else len(self._index.messages)
+        self._index = scan_mcap(self._file, self._index)
+        self.complete = self._index.complete
+        if len(self._index.messages) == before:
+            return False
+        beside = self._file.parent / "rig.json"
+        stated = NOTHING.with_rig(beside) if beside.is_file() else NOTHING
+        with suppress(ScanError):  # no depth frame yet
+            scan = _scan_of(self._index, self._path, stated, self._infos)
+            self.scan = scan if stated.rig_path is None else with_rig(scan, stated.rig_path)
+        return True
+
+
+def _scan_of(index: McapIndex, path: Path, stated: Stated, infos: dict[int, FrameInfo]) -> Scan:
+    """infos : what was said of frames, by its place in the file; read once."""
+    file = index.path
     said = index.metadata.get(LIBRARY, {})
     start_ns = _number(said.get("start_ns"), min((e.log_ns for e in index.messages), default=0))
-    streams = {c: _stream_of(index, c) for c, channel in index.channels.items() if channel.schema == IMAGE}
+    streams = {c: _stream_of(index, c, infos) for c, channel in index.channels.items() if channel.schema == IMAGE}
     whole = {c: _without_torn(index, s) for c, s in streams.items()}
     kinds = {kind: [s for s in whole.values() if s.kind == kind and s.frames] for kind in ("depth", "color", "thermal")}
     if not kinds["depth"]:
@@ -107,7 +140,7 @@ def _environment(text: str) -> Environment:
 # ---------------------------------------------------------------- streams
 
 
-def _stream_of(index: McapIndex, channel: int) -> _Recorded:
+def _stream_of(index: McapIndex, channel: int, known: dict[int, FrameInfo]) -> _Recorded:
     """A channel's pictures with what was said of each; a picture of which nothing was said is none."""
     own = index.channels[channel]
     beside = {c for c, x in index.channels.items() if x.schema == FRAME_INFO and x.topic == f"{own.topic}/info"}
@@ -115,7 +148,9 @@ def _stream_of(index: McapIndex, channel: int) -> _Recorded:
     for e in index.messages:
         if e.channel in beside:
             try:
-                infos[e.sequence] = read_frame_info(_bytes(index.path, e, 4096))
+                if e.offset not in known:
+                    known[e.offset] = read_frame_info(_bytes(index.path, e, 4096))
+                infos[e.sequence] = known[e.offset]
             except ValueError:
                 index.damaged.append(e.offset)
     try:
@@ -251,7 +286,7 @@ def raw_streams(path: Path) -> list[RawStream]:
     index = scan_mcap(file)
     found = []
     for c, channel in index.channels.items():
-        stream = _without_torn(index, _stream_of(index, c)) if channel.schema == IMAGE else None
+        stream = _without_torn(index, _stream_of(index, c, {})) if channel.schema == IMAGE else None
         if stream is None or not stream.frames:
             continue
         first = _picture(file, stream.frames[0], stream.infos[0])
