@@ -15,7 +15,20 @@ PACKAGE = ROOT / "thermofusion"
 NOUNS = ("types", "errors", "version", "progress")
 BASE = (*NOUNS, "robust", "recipe", "files", "geometry")
 STEPS = ("tracking", "surface", "rig", "mapping", "temperature")
-ALL = (*BASE, "physics", "scans", "depth", *STEPS, "diagnosis", "export", "regions", "report", "results", "pipeline")
+ALL = (
+    *BASE,
+    "physics",
+    "scans",
+    "depth",
+    "motion",
+    *STEPS,
+    "diagnosis",
+    "export",
+    "regions",
+    "report",
+    "results",
+    "pipeline",
+)
 
 # Room -> rooms that it may import, late and typing imports included. What is not named is forbidden.
 MAY_IMPORT: dict[str, tuple[str, ...]] = {
@@ -31,15 +44,16 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "scans": (*BASE, "physics"),
     "depth": BASE,
     "tracking": (*BASE, "depth", "scans"),
-    "surface": (*BASE, "depth"),
-    "rig": (*BASE, "physics"),
-    "mapping": (*BASE, "physics", "rig"),
+    "motion": BASE,
+    "surface": (*BASE, "depth", "motion"),
+    "rig": (*BASE, "physics", "motion"),
+    "mapping": (*BASE, "physics", "motion", "rig"),
     "temperature": (*BASE, "physics", "mapping"),
     "diagnosis": (*BASE, "mapping", "temperature"),
     "export": BASE,
     "regions": (*BASE, "export"),
-    "report": (*BASE, "physics", "diagnosis", "export", "regions", *STEPS),
-    "results": (*BASE, "export", "regions", "report", *STEPS),
+    "report": (*BASE, "physics", "motion", "diagnosis", "export", "regions", *STEPS),
+    "results": (*BASE, "motion", "export", "regions", "report", *STEPS),
     "pipeline": (*BASE, "scans", *STEPS, "export", "report", "results"),
     "handover": (*BASE, "export", "regions", "report"),
     "judge": ALL,

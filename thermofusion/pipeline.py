@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 # A stage is handed exactly the recipe sections that its key holds. It also depends on all stages before it.
 STAGES = (
     Stage("tracking", ("input", "subject", "tracking")),
-    Stage("surface", ("input", "subject", "surface")),
+    Stage("surface", ("input", "subject", "surface"), edition=2),
     Stage("rig", ("input", "rig"), edition=3),
     Stage("mapping", ("input", "mapping"), edition=5),
     Stage("temperature", ("mapping", "temperature"), edition=5, handed_out=RESULT),
@@ -123,13 +123,13 @@ class _Run:
         surface = step("surface", partial(fuse_surface, scan, tracking))
         if surface is None:
             return Steps(tracking)
-        mesh, trajectory, window_m = surface.mesh, tracking.trajectory, surface.normal_window_m
+        mesh, path, window_m = surface.mesh, surface.path(tracking.trajectory), surface.normal_window_m
         if scan.thermal is None:
             return Steps(tracking, surface, temperature=unmeasured(mesh, self.recipe.temperature))
         # 2. Rig
-        rig = step("rig", partial(align, scan, mesh, trajectory))
+        rig = step("rig", partial(align, scan, mesh, path))
         # 3. Mapping
-        mapped = step("mapping", partial(observe, scan, mesh, trajectory, rig))
+        mapped = step("mapping", partial(observe, scan, mesh, path, rig))
         # 4. Temperature, while the pictures' rays are cast on the other core
         self.cast(Steps(tracking, surface))
         temperature = step("temperature", partial(solve, scan, mesh, mapped, normal_window_m=window_m))

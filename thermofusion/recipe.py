@@ -102,6 +102,7 @@ class SurfaceSection(_Section):
         2.0, ge=1e-5, le=1024, description="bound on the voxel grid's memory; the voxel grows to meet it"
     )
     color: bool = Field(True, description="colour the surface from the colour camera")
+    motion: bool = Field(True, description="solve how the subject moved (sway, breath, arms) and fuse it at rest")
 
 
 class RigSection(_Section):

@@ -7,12 +7,13 @@ the rim of a hole or of the cut at the waist is dropped (the body goes on where 
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..types import Camera, Float, Float32, SurfaceMesh
+from ..types import Camera, Float, Float32, Int, SurfaceMesh
 from .camera import pixel_rays, project
 from .mesh import undirected_edges
 from .rays import RayScene, rays_from
@@ -41,13 +42,23 @@ class OutlineCaster:
     def __init__(self, mesh: SurfaceMesh, camera: Camera, steps_across: int = GRID_STEPS_ACROSS) -> None:
         self._scene = RayScene(mesh.vertices_m, mesh.triangles)
         self._mesh = mesh
-        self._border = border_tree(mesh)
+        self._ends = border_ends(mesh)
+        self._border = _tree(mesh, self._ends)
         self._step = max(1, round(camera.width_px / steps_across))
         u, v = np.meshgrid(
             np.arange(self._step / 2, camera.width_px, self._step),
             np.arange(self._step / 2, camera.height_px, self._step),
         )
         self._rays = pixel_rays(camera, u, v).astype(np.float32)
+
+    def posed(self, mesh: SurfaceMesh) -> OutlineCaster:
+        """The same for the same mesh with its vertices moved; itself where it is the very same."""
+        if mesh is self._mesh:
+            return self
+        other = copy(self)
+        other._mesh, other._scene = mesh, RayScene(mesh.vertices_m, mesh.triangles)
+        other._border = _tree(mesh, self._ends)
+        return other
 
     def contour(self, T_world_thermal: Float) -> Contour:
         """The outline against the background, as seen from T_world_thermal (4, 4)."""
@@ -87,10 +98,18 @@ class OutlineCaster:
         return Contour(point, normal)
 
 
-def border_tree(mesh: SurfaceMesh) -> cKDTree | None:
-    """Search tree of the vertices on open borders: on edges with one triangle only. None for a closed mesh."""
+def border_ends(mesh: SurfaceMesh) -> Int:
+    """(N,) the vertices on open borders: on edges with one triangle only."""
     edges, border = undirected_edges(mesh.triangles)
-    ends = np.unique(edges[border])
+    return np.unique(edges[border])
+
+
+def border_tree(mesh: SurfaceMesh) -> cKDTree | None:
+    """Search tree of the vertices on open borders; None for a closed mesh."""
+    return _tree(mesh, border_ends(mesh))
+
+
+def _tree(mesh: SurfaceMesh, ends: Int) -> cKDTree | None:
     return cKDTree(mesh.vertices_m[ends]) if len(ends) else None
 
 

@@ -218,12 +218,16 @@ def _with_motion(
     assert result.temperature is not None
     assert scan.thermal is not None
     surface, mapped, camera = result.surface.mesh, result.mapped, result.rig.camera
-    motion = view_corrections(scan.thermal, surface, mapped.views, result.rig.outline_width_px, progress=progress)
+    motion = view_corrections(
+        scan.thermal, surface, mapped.views, result.rig.outline_width_px, result.surface.motion, progress=progress
+    )
     report = replace(report, messages=(*report.messages, *motion.messages))
     if not motion.kept:
         return report
     views = replace(mapped.views, T_world_thermal=motion.T_world_thermal)
-    rows = observe_views(scan.thermal, SurfaceRays(surface), views, SignalConverter(camera), recipe.mapping)
+    rows = observe_views(
+        scan.thermal, SurfaceRays(surface, result.surface.motion), views, SignalConverter(camera), recipe.mapping
+    )
     moved = replace(mapped, views=views, observations=rows)
     bench = Bench.of(scan, result.surface, moved, result.temperature, recipe)
     left = bench.sample(report.vertices).predictions(folds, progress)

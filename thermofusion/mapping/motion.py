@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..geometry.rigid import invert, se3_exp
+from ..motion.body import BodyMotion, mesh_at
 from ..progress import Progress, silent
 from ..rig.outlines import OutlineResidual, OutlineView, measure_outline, reach_px, read_outlines, weights_about_median
 from ..robust import mad_sigma
@@ -52,6 +53,7 @@ def view_corrections(
     mesh: SurfaceMesh,
     views: ThermalViews,
     width_px: float = float("nan"),
+    body: BodyMotion | None = None,
     *,
     progress: Progress = silent,
 ) -> MotionResult:
@@ -60,13 +62,18 @@ def view_corrections(
     Parameters
     ----------
     views : the aligned views. width_px : of the outline, common to all views (`rig`); NaN: its median is used.
+    body : how the subject moved.
 
     Raises ScanError for an image that cannot be read.
     """
     camera = stream.camera.lens
     poses = views.T_world_thermal
     outlines, contrast = read_outlines(
-        stream, mesh, views.frame.tolist(), poses, lambda _, done, total: progress("mapping", done, total)
+        stream,
+        mesh_at(mesh, body, views.times_s),
+        views.frame.tolist(),
+        poses,
+        lambda _, done, total: progress("mapping", done, total),
     )
     if contrast is None:
         return _none(views, "the outline does not stand out from the background in the thermal images")

@@ -8,6 +8,7 @@ its pixel is clear of silhouettes: there the point spread mixes skin with room (
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -19,6 +20,7 @@ from ..geometry.camera import project, viewing_cosine
 from ..geometry.mesh import undirected_edges
 from ..geometry.rays import RayScene
 from ..geometry.rigid import invert, transform_points
+from ..motion.body import BodyMotion, moved_by, parted
 from ..physics.signal import SignalConverter
 from ..progress import Progress, silent
 from ..recipe import InputSection, MappingSection
@@ -50,22 +52,40 @@ NORMAL_OFFSET_M = 0.003  # a ray to the eye starts this far off the surface, so 
 class SurfaceRays:
     """A mesh prepared for asking what a camera sees of it: ray casting, contours, visibility."""
 
-    def __init__(self, mesh: SurfaceMesh) -> None:
-        self.mesh = mesh
+    def __init__(self, mesh: SurfaceMesh, motion: BodyMotion | None = None) -> None:
+        """motion : of the subject, for `at`."""
+        self.mesh, self._motion = mesh, motion
+        self._moved: Float32 | None = None
         self._scene = RayScene(mesh.vertices_m, mesh.triangles)
         self._lifted = mesh.vertices_m + np.float32(NORMAL_OFFSET_M) * mesh.normals
         edges, self._on_boundary = undirected_edges(mesh.triangles)
         self._edge_a, self._edge_b = np.ascontiguousarray(edges[:, 0]), np.ascontiguousarray(edges[:, 1])
 
+    def at(self, time_s: float) -> SurfaceRays:
+        """The same as the subject stands at a time, s on the depth clock."""
+        if self._motion is None:
+            return self
+        posed = copy(self)
+        posed._moved = self._motion.affine_at(time_s)
+        posed.mesh = moved_by(self.mesh, posed._moved)
+        return posed
+
     def visible(self, vertices: NDArray, eye_m: NDArray, tolerance_m: float) -> Bool:
         """Whether nothing lies between each of the vertices (indices) and the eye, (N,).
 
-        The first `tolerance_m` of the way do not count: a noisy surface shadows itself at grazing angles.
+        The first `tolerance_m` of the way do not count: a noisy surface shadows itself at grazing angles. Of a subject
+        that moved, rays run in the surface at rest, from each vertex to where the eye is for it: what stands in the way
+        is taken to move with it, which is true to a few millimetres near to the vertex, where it matters.
         """
         rays = np.empty((len(vertices), 6), np.float32)
         start, ray = rays[:, :3], rays[:, 3:]
         np.take(self._lifted, vertices, axis=0, out=start, mode="clip")
-        np.subtract(eye_m.astype(np.float32), start, out=ray)
+        eye = eye_m.astype(np.float32)
+        if self._moved is None:
+            np.subtract(eye, start, out=ray)
+        else:
+            M = self._moved.take(vertices, axis=0, mode="clip")
+            np.subtract(np.einsum("vji,vj->vi", M[:, :, :3], eye - M[:, :, 3]), start, out=ray)
         nearest = np.sqrt(np.einsum("ij,ij->i", ray, ray).min(initial=np.inf))
         near = tolerance_m / max(float(nearest), tolerance_m)
         return ~self._scene.occluded(rays, near, 1.0)
@@ -114,7 +134,7 @@ class Mapped:
 def observe(
     scan: Scan,
     surface: SurfaceMesh,
-    trajectory: Trajectory,
+    path: Trajectory | BodyMotion,
     rig: RigResult,
     *,
     input: InputSection,
@@ -123,8 +143,10 @@ def observe(
 ) -> Mapped:
     """Project all thermal views onto the surface, with the aligned rig and clock.
 
+    path : of the depth camera; or with it how the subject moved: every view sees it as it stood at the view's own time.
     Raises ScanError if no thermal frame can be placed, or no view sees the surface.
     """
+    trajectory, body = parted(path)
     if scan.thermal is None or len(scan.thermal) == 0:
         raise ScanError("the scan has no thermal frames", place=scan.root)
     stream, motion = scan.thermal, None
@@ -133,13 +155,13 @@ def observe(
     else:
         views, left_out = thermal_views(scan, trajectory, input.max_pose_gap_ms / 1e3, rig.camera, rig.frame_dt_s)
     if mapping.view_motion and rig.free is None:  # free views follow the outline one by one already
-        motion = view_corrections(stream, surface, views, rig.outline_width_px, progress=progress)
+        motion = view_corrections(stream, surface, views, rig.outline_width_px, body, progress=progress)
         views = replace(views, T_world_thermal=motion.T_world_thermal)
     converter = SignalConverter(stream.camera)
     bad = bad_pixels(stream, views.frame, converter)
     if bad.any():
         converter = SignalConverter(stream.camera, bad)
-    observations = observe_views(stream, SurfaceRays(surface), views, converter, mapping, progress=progress)
+    observations = observe_views(stream, SurfaceRays(surface, body), views, converter, mapping, progress=progress)
     blackbodies = read_blackbodies(stream, views, scan.references, converter)
     uv = np.argwhere(bad)[:, ::-1].astype(np.int32)
     background = find_background(stream, surface, views, converter, scan.references)
@@ -161,7 +183,8 @@ def observe_views(
     def one(view: int) -> Observations:
         frame = int(views.frame[view])
         image = converter.radiance(stream.load(frame), stream.places[frame])
-        return observe_view(surface, stream.camera.lens, views.T_world_thermal[view], image, mapping, view=view)
+        posed = surface.at(float(views.times_s[view]))
+        return observe_view(posed, stream.camera.lens, views.T_world_thermal[view], image, mapping, view=view)
 
     parts: list[Observations] = []
     with ThreadPoolExecutor(max_workers=3) as pool:

@@ -20,6 +20,7 @@ from .metadata import radiometric_numbers, stated
 
 if TYPE_CHECKING:
     from ..mapping.observe import Mapped
+    from ..motion.body import BodyMotion
     from ..rig.align import RigResult
     from ..rig.free.place import FreeViews
     from ..surface.surface import SurfaceResult
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
 PAGE = "report.html"  # in a result's folder
 PERCENTILES = (1, 5, 50, 95, 99)
+MOST_MOVED = 3  # parts that the summary names
 WORST = 3  # diagnoses that the summary prints
 FAULT_OVER_SIGMA = 3.0  # of the gate's median sigma: a fault beyond it makes the result doubtful
 
@@ -54,6 +56,7 @@ def result_report(scan: Scan, recipe: Recipe, steps: Steps, reused: Sequence[str
     messages = [*scan.notes, *steps.tracking.messages]
     if steps.surface is not None:
         report["surface"] = _surface(steps.surface)
+        report["motion"] = _motion(steps.surface.motion)
         messages += steps.surface.messages
     if steps.rig is not None:
         report["rig"] = _rig(scan, steps.rig)
@@ -99,6 +102,8 @@ def summary(report: Mapping[str, Any], out: Path | None) -> str:
     lines = [f"camera path  {_path(r['tracking'])}"]
     if "surface" in r:
         lines.append(f"surface      {r['surface']['vertices']:,} vertices, {r['surface']['voxel_mm']:.1f} mm apart")
+    if r.get("motion", {}).get("moved"):
+        lines.append(f"motion       {_motion_line(r['motion'])}")
     if "rig" in r:
         lines.append(f"rig          {_rig_line(r['rig'])}")
     if "mapping" in r:
@@ -185,6 +190,30 @@ def _surface(s: SurfaceResult) -> dict[str, Any]:
         "floor_plane": s.floor_plane,
         "removed": s.removed,
     }
+
+
+def _motion(m: BodyMotion | None) -> dict[str, Any]:
+    """How the subject moved while it was recorded."""
+    if m is None:
+        return {"moved": False, "parts": []}
+    return {
+        "moved": True,
+        "parts": [vars(p) for p in m.parts],
+        "median_mm": float(np.median(m.moved_mm)),
+        "p95_mm": float(np.percentile(m.moved_mm, 95)),
+        "left_out_before": m.left_out_before,
+        "left_out_after": m.left_out_after,
+        "nodes": len(m.field.node_m),
+        "knots": len(m.field.knot_s),
+        "too_much_s": m.too_much,
+    }
+
+
+def _motion_line(m: Mapping[str, Any]) -> str:
+    """The parts that moved most, in words."""
+    most = sorted(m["parts"], key=lambda p: -p["rms_mm"])[:MOST_MOVED]
+    parts = ", ".join(f"{p['name']} {p['rms_mm']:.0f} mm" for p in most)
+    return f"the subject moved against its trunk and was brought to rest: {parts} (rms)"
 
 
 def _rig(scan: Scan, a: RigResult) -> dict[str, Any]:

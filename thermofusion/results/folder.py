@@ -16,6 +16,7 @@ from ..files.json import to_json
 from ..files.reading import read_image, read_json, read_whole
 from ..files.whole import changing_over, write_text
 from ..mapping.observe import Mapped
+from ..motion.body import parted
 from ..recipe import Recipe, load_recipe
 from ..regions import Measured, Measurer, Region
 from ..report.casts import DOUBTS
@@ -71,6 +72,8 @@ class Result(Steps):
     def trajectory(self) -> Trajectory:
         """Poses of the depth camera, in the result's frame."""
         trajectory = self.tracking.trajectory
+        if self.surface is not None:
+            trajectory = parted(self.surface.path(trajectory))[0]
         return trajectory if self.frame is None else self.frame.trajectory(trajectory)
 
     def measure(self, *regions: Region) -> Measured:

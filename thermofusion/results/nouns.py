@@ -26,6 +26,9 @@ def stored() -> MappingProxyType[str, type]:
     from ..mapping.motion import MotionResult
     from ..mapping.observe import Mapped
     from ..mapping.references import BlackbodyReading
+    from ..motion.body import BodyMotion, PartMotion
+    from ..motion.field import MotionField
+    from ..motion.graph import Binding
     from ..rig.align import RigResult
     from ..rig.free.place import FreeViews
     from ..surface.clean import RemovedPart
@@ -51,7 +54,9 @@ def stored() -> MappingProxyType[str, type]:
     return MappingProxyType(
         {
             "background/1": Background,
+            "binding/1": Binding,
             "blackbody-reading/1": BlackbodyReading,
+            "body-motion/1": BodyMotion,
             "calibration/1": Calibration,
             "camera/1": Camera,
             "free-views/1": FreeViews,
@@ -60,7 +65,9 @@ def stored() -> MappingProxyType[str, type]:
             "mapped/2": Mapped,
             "mapped/1": Mapped,  # without `background`
             "motion/1": MotionResult,
+            "motion-field/1": MotionField,
             "observations/1": Observations,
+            "part-motion/1": PartMotion,
             "removed-part/1": RemovedPart,
             "rig/1": RigResult,
             "shared-errors/1": SharedErrors,
@@ -68,7 +75,8 @@ def stored() -> MappingProxyType[str, type]:
             "sensor-pattern/1": Pattern,
             "signal-curve/1": SignalCurve,
             "surface-mesh/1": SurfaceMesh,
-            "surface/1": SurfaceResult,
+            "surface/2": SurfaceResult,
+            "surface/1": SurfaceResult,  # without `motion`
             "temperature/3": Temperature,
             "temperature/2": Temperature,  # without `room`
             "temperature/1": Temperature,  # without `shared`

@@ -17,13 +17,16 @@ alignment is seen where they are calibrated against each other (`crosscal`) and 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ScanError
 from ..geometry.rigid import interpolate_trajectory, invert
+from ..motion.body import BodyMotion, mesh_at, parted
 from ..progress import Progress, silent
 from ..recipe import InputSection, RigSection
 from ..types import Float, Scan, SurfaceMesh, ThermalCamera, ThermalStream, Trajectory, brief
@@ -46,6 +49,7 @@ from .free.place import FreeViews, place_views
 from .jitter import frame_times
 from .outlines import read_outlines, search_shift
 
+BodyAt = Callable[[Float], Callable[[int], SurfaceMesh]]  # times, s -> row -> the subject as it stood then
 MAX_VIEWS = 30  # that enter: more cost time and say nothing new
 MIN_VIEWS = 6
 HELD_SHARE = 0.7  # a sigma this near to its prior's is the prior's
@@ -108,7 +112,7 @@ class RigResult:
 def align(
     scan: Scan,
     mesh: SurfaceMesh,
-    trajectory: Trajectory,
+    path: Trajectory | BodyMotion,
     *,
     input: InputSection,
     rig: RigSection,
@@ -118,12 +122,12 @@ def align(
 
     Parameters
     ----------
-    mesh : the fused surface, world frame. trajectory : T_world_depth on the depth clock.
+    mesh : the fused surface, world frame. path : T_world_depth on the depth clock; or with it how the subject moved.
     progress : called with ("rig", views read, views in all).
 
     Raises ScanError if the scan has no thermal stream, or an image cannot be read.
     """
-    stream = scan.thermal
+    stream, (trajectory, body) = scan.thermal, parted(path)
     if stream is None:
         raise ScanError("the scan has no thermal stream", place=scan.root, hint="there is nothing to align")
     camera, start = stream.camera, State.of(stream.camera)
@@ -134,7 +138,9 @@ def align(
     frames = _frames(stream, trajectory, input.max_pose_gap_ms / 1e3)
     T_world_depth, _ = interpolate_trajectory(trajectory, stream.depth_times_s[frames])
     T_world_thermal = T_world_depth @ invert(start.T_thermal_depth)
-    outlines, contrast = read_outlines(stream, mesh, frames.tolist(), T_world_thermal, progress)
+    body_at = partial(mesh_at, mesh, body)
+    mesh_of = body_at(stream.depth_times_s[frames])
+    outlines, contrast = read_outlines(stream, mesh_of, frames.tolist(), T_world_thermal, progress)
     if len(outlines) < MIN_VIEWS:
         return _unchanged(camera, f"fewer than {MIN_VIEWS} thermal views show an outline that could be used")
     begin = camera
@@ -145,7 +151,7 @@ def align(
             turned = start.moved(np.concatenate([rotation, np.zeros(6)]))
             begin = replace(camera, T_thermal_depth=turned.T_thermal_depth)
             T_world_thermal = T_world_depth @ invert(begin.T_thermal_depth)
-            outlines, contrast = read_outlines(stream, mesh, frames.tolist(), T_world_thermal, progress)
+            outlines, contrast = read_outlines(stream, mesh_of, frames.tolist(), T_world_thermal, progress)
     if contrast is None or len(outlines) < MIN_VIEWS:
         return _unchanged(camera, "the outline does not stand out from the background in the thermal images")
     times_s = stream.times_s[frames[[v.row for v in outlines]]]
@@ -153,7 +159,7 @@ def align(
     result = _refined(measured, begin)
     jitter = frame_times(measured, State.of(result.camera))
     if jitter is not None:
-        result = _with_times(stream, mesh, measured, begin, input.max_pose_gap_ms / 1e3)
+        result = _with_times(stream, body_at, measured, begin, input.max_pose_gap_ms / 1e3)
     if begin is camera:
         return result
     if not result.converged:
@@ -208,11 +214,11 @@ def _placed(
 
 
 def _with_times(
-    stream: ThermalStream, mesh: SurfaceMesh, chosen: OutlineSet, begin: ThermalCamera, max_gap_s: float
+    stream: ThermalStream, body_at: BodyAt, chosen: OutlineSet, begin: ThermalCamera, max_gap_s: float
 ) -> RigResult:
     """The rig again, with the time of each view unknown, and then the times of all frames.
 
-    chosen : the views that enter, at their stamps, which jitter.
+    body_at : times -> which surface each view sees. chosen : the views that enter, at their stamps, which jitter.
     """
     start = state = State.of(begin)
     times = at_start = frame_times(chosen, start, sure=True)
@@ -231,8 +237,9 @@ def _with_times(
     result = _decided(chosen, begin, solved, before, chosen.later(times.dt_s).residual_px(state))
     state = State.of(result.camera)
     frames = np.flatnonzero(_placed(stream, chosen.trajectory, state.time_offset_s, 0.0, max_gap_s))
-    T_world_depth, _ = interpolate_trajectory(chosen.trajectory, stream.times_s[frames] + state.time_offset_s)
-    views, _ = read_outlines(stream, mesh, frames.tolist(), T_world_depth @ invert(state.T_thermal_depth))
+    taken_s = stream.times_s[frames] + state.time_offset_s
+    T_world_depth, _ = interpolate_trajectory(chosen.trajectory, taken_s)
+    views, _ = read_outlines(stream, body_at(taken_s), frames.tolist(), T_world_depth @ invert(state.T_thermal_depth))
     seen = frames[[v.row for v in views]]
     times = frame_times(replace(chosen, views=views, times_s=stream.times_s[seen]), state, sure=True)
     assert times is not None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,20 +66,21 @@ class OutlineResidual:
 
 def read_outlines(
     stream: ThermalStream,
-    mesh: SurfaceMesh,
+    mesh_of: Callable[[int], SurfaceMesh],
     frames: Sequence[int],
     T_world_thermal: Float,
     progress: Progress = silent,
 ) -> tuple[tuple[OutlineView, ...], Contrast | None]:
     """Images and model outlines of thermal frames at poses (N, 4, 4), and how the outline shows in them.
 
-    The contrast is None where nothing stands out. Raises ScanError for an image that cannot be read.
+    mesh_of : row among the frames -> the subject's surface as it stood then. The contrast is None where nothing stands
+    out. Raises ScanError for an image that cannot be read.
     """
     lens = stream.camera.lens
-    converter, caster = SignalConverter(stream.camera), OutlineCaster(mesh, lens)
+    converter, caster = SignalConverter(stream.camera), OutlineCaster(mesh_of(0), lens)
     views: list[OutlineView] = []
     for row, frame in enumerate(frames):
-        contour = caster.contour(T_world_thermal[row])
+        contour = caster.posed(mesh_of(row)).contour(T_world_thermal[row])
         if len(contour) >= MIN_POINTS_OF_VIEW:
             every = -(-len(contour) // MAX_POINTS)
             thinned = Contour(contour.point_m[::every], contour.normal[::every])

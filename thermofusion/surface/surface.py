@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -13,12 +13,15 @@ from ..errors import ScanError
 from ..geometry.mesh import canonical, close_pinholes, smooth_positions
 from ..geometry.normals import window_normals
 from ..geometry.rigid import interpolate_trajectory
+from ..motion.body import BodyMotion
+from ..motion.coarse import Remembering
 from ..progress import Progress, silent
 from ..recipe import InputSection, SubjectSection, SurfaceSection
 from ..types import Float, Float32, Int, Scan, SurfaceMesh, Trajectory, brief
-from .clean import RemovedPart, subject_only
+from .clean import Cleaned, RemovedPart, subject_only
 from .color import color_vertices
-from .tsdf import BYTES_PER_BLOCK, FramePoses, Frames, VoxelGrid, integrate_frames, plan_grid, survey_depth
+from .moving import RigidFusion, at_rest
+from .tsdf import BYTES_PER_BLOCK, FramePoses, Frames, GridPlan, VoxelGrid, integrate_frames, plan_grid, survey_depth
 
 SAME_TIME_S = 1e-3  # a pose this near in time is the frame's own
 PINHOLE_VOXELS = 14.0  # round a hole of two voxels' radius
@@ -32,7 +35,8 @@ class SurfaceResult:
     mesh : in world metres. voxel_m, truncation_m : of the grid. max_range_m : depth beyond it was not used.
     noise_m_at_1m : depth noise estimated from the data, grows with range². blocks_estimated, blocks_used, memory_gib :
     of the grid. normal_window_m : diameter over which normals were averaged. floor_plane : (4,)
-    `[n, d]`, n·p + d = height above the floor in metres; None = none found.
+    `[n, d]`, n·p + d = height above the floor in metres; None = none found. motion : how the subject moved; None = it
+    stood as still as can be told.
     """
 
     mesh: SurfaceMesh
@@ -48,8 +52,13 @@ class SurfaceResult:
     floor_plane: Float | None
     removed: tuple[RemovedPart, ...]
     messages: tuple[str, ...]
+    motion: BodyMotion | None = None
 
     __repr__ = brief
+
+    def path(self, tracked: Trajectory) -> Trajectory | BodyMotion:
+        """Of the depth camera against the subject's trunk, with its motion, if it moved; else `tracked`."""
+        return tracked if self.motion is None else self.motion
 
 
 class Tracked(Protocol):
@@ -86,22 +95,29 @@ def fuse_surface(
     poses = depth_poses(scan, tracked.trajectory, max_gap_s)
     survey = survey_depth(scan, frames, poses)
     plan = plan_grid(scan, survey, input=input, surface=surface)
-    grid, plan = integrate_frames(survey, frames, poses, plan, input=input, surface=surface, progress=progress)
+    seen = Remembering(frames, len(poses.frame)) if surface.motion else frames
+    grid, plan = integrate_frames(survey, seen, poses, plan, input=input, surface=surface, progress=progress)
     found = _extracted(grid, len(poses.frame), surface.min_weight, scan)
     clean = subject_only(*found, survey, plan, subject=subject, floor_plane=tracked.floor_plane)
-    if len(clean.triangles) == 0:
-        gone = ", ".join(f"{r.area_cm2:.0f} cm² {r.reason}" for r in clean.removed)
-        raise ScanError(
-            f"no surface is left after cleaning: {gone}",
-            place=scan.root,
-            hint="set subject.background = keep, or a smaller subject.min_component_cm2",
-        )
-    triangles = close_pinholes(clean.vertices_m, clean.triangles, PINHOLE_VOXELS * plan.voxel_m)
-    vertices = smooth_positions(clean.vertices_m, triangles, surface.smooth_iterations)
-    normals = window_normals(vertices, triangles, surface.normal_window_mm / 1e3)
-    color = color_vertices(scan, tracked.trajectory, vertices, normals, max_gap_s) if surface.color else None
+    mesh, trajectory, motion = _finished(clean, plan, surface, scan), tracked.trajectory, None
+    moved = None
+    if isinstance(seen, Remembering):
+        rigid = RigidFusion(seen, scan.depth.times_s, poses, survey, plan, clean, mesh)
+        moved = rigid.moved(input=input, subject=subject, surface=surface)
+    if moved is not None:
+        plan = replace(plan, blocks=max(grid.blocks, 1))
+        again = survey, moved.frames, moved.poses, plan
+        grid, plan = integrate_frames(*again, input=input, surface=surface, progress=progress)
+        found = _extracted(grid, len(poses.frame), surface.min_weight, scan)
+        mesh = _finished(at_rest(found, clean, survey, plan, subject=subject), plan, surface, scan)
+        up = clean.floor_plane[:3] if clean.floor_plane is not None else -poses.T_world_depth[:, :3, 1].mean(0)
+        motion = moved.of(mesh, scan.depth.times_s, up)
+        trajectory = motion.trajectory
+    if surface.color:
+        color = color_vertices(scan, trajectory, mesh.vertices_m, mesh.normals, max_gap_s)
+        mesh = replace(mesh, color_rgb=color)
     return SurfaceResult(
-        mesh=SurfaceMesh(vertices, triangles, normals, color),
+        mesh=mesh,
         voxel_m=plan.voxel_m,
         truncation_m=plan.truncation_m,
         max_range_m=plan.max_range_m,
@@ -114,7 +130,22 @@ def fuse_surface(
         floor_plane=clean.floor_plane,
         removed=clean.removed,
         messages=(*plan.messages, *clean.messages),
+        motion=motion,
     )
+
+
+def _finished(clean: Cleaned, plan: GridPlan, surface: SurfaceSection, scan: Scan) -> SurfaceMesh:
+    """The subject's surface with its pinholes closed, smoothed as the recipe says, with normals; no colour yet."""
+    if len(clean.triangles) == 0:
+        gone = ", ".join(f"{r.area_cm2:.0f} cm² {r.reason}" for r in clean.removed)
+        raise ScanError(
+            f"no surface is left after cleaning: {gone}",
+            place=scan.root,
+            hint="set subject.background = keep, or a smaller subject.min_component_cm2",
+        )
+    triangles = close_pinholes(clean.vertices_m, clean.triangles, PINHOLE_VOXELS * plan.voxel_m)
+    vertices = smooth_positions(clean.vertices_m, triangles, surface.smooth_iterations)
+    return SurfaceMesh(vertices, triangles, window_normals(vertices, triangles, surface.normal_window_mm / 1e3))
 
 
 def _extracted(grid: VoxelGrid, frames: int, min_weight: float, scan: Scan) -> tuple[Float32, Int]:

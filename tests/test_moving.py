@@ -1,0 +1,175 @@
+"""How a subject moved: the solver against dense algebra, motion of a made body found again, frames brought to rest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from support.walkround import ellipsoid, walk
+
+from thermofusion.geometry._open3d import o3d
+from thermofusion.geometry.camera import pixel_rays
+from thermofusion.geometry.rigid import invert, se3_exp, transform_points
+from thermofusion.motion.body import moved_by
+from thermofusion.motion.estimate import STILL, estimate, look_points
+from thermofusion.motion.field import MotionField, affine, displacement, rotations
+from thermofusion.motion.gauge import common_motion, poses_without, without
+from thermofusion.motion.graph import bind, build_graph
+from thermofusion.motion.parts import name_parts
+from thermofusion.motion.rest import unrest
+from thermofusion.motion.rows import CoarseFrames
+from thermofusion.motion.solve import Tridiagonal
+from thermofusion.motion.warp import RestSurface, Warp
+from thermofusion.phantom.scene import ShapeConfig
+from thermofusion.phantom.shapes import build_shape
+from thermofusion.types import Camera, SurfaceMesh
+
+SMALL = Camera(160, 120, np.array([[140.0, 0, 79.5], [0, 140, 59.5], [0, 0, 1]]))
+NOISE_M = 1e-3
+LEAN_DEG, LEAN_S = 2.0, 8.0  # of the made body's upper half, in and out
+
+
+@pytest.fixture(scope="module")
+def body() -> SurfaceMesh:
+    return ellipsoid(60)
+
+
+def leaning(mesh: SurfaceMesh, angle_rad: float) -> SurfaceMesh:
+    """The upper half turned about a hip line; the share of the turn grows over 20 cm."""
+    share = np.clip(mesh.vertices_m[:, 2] / 0.2, 0, 1)
+    share = share * share * (3 - 2 * share)
+    turn = np.zeros((len(mesh), 3))
+    turn[:, 0] = share * angle_rad
+    moved = np.einsum("vij,vj->vi", rotations(turn), mesh.vertices_m.astype(np.float64))
+    return replace(mesh, vertices_m=moved.astype(np.float32))
+
+
+def depth_of(mesh: SurfaceMesh, camera: Camera, T_world_depth: np.ndarray) -> np.ndarray:
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(o3d.core.Tensor(mesh.vertices_m), o3d.core.Tensor(mesh.triangles.astype(np.uint32)))
+    rays = pixel_rays(camera)
+    rays = rays / rays[..., 2:]
+    eye = np.broadcast_to(T_world_depth[:3, 3], rays.shape)
+    cast = np.concatenate([eye, rays @ T_world_depth[:3, :3].T], -1).astype(np.float32)
+    z = scene.cast_rays(o3d.core.Tensor(cast))["t_hit"].numpy()
+    return np.where(np.isfinite(z), z, np.float32(np.nan))
+
+
+def recorded(mesh: SurfaceMesh, angle_deg: float) -> CoarseFrames:
+    """A walk round a body that leans to and fro."""
+    path, rng = walk(12.0, tremor=0.3), np.random.default_rng(4)
+    images = []
+    for t, T in zip(path.times_s, path.T_world_depth, strict=True):
+        z = depth_of(leaning(mesh, np.radians(angle_deg) * np.sin(2 * np.pi * t / LEAN_S)), SMALL, T)
+        images.append((z + rng.normal(0, NOISE_M, z.shape) * z**2).astype(np.float32))
+    K = SMALL.K
+    return CoarseFrames(images, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), path.times_s, path.T_world_depth)
+
+
+def test_a_block_tridiagonal_system_is_solved_as_dense_algebra_does():
+    rng = np.random.default_rng(0)
+    F, m = 5, 7
+    own = np.array([a @ a.T + 20 * np.eye(m) for a in rng.normal(size=(F, m, m))])
+    after = rng.normal(size=(F - 1, m, m))
+    dense = np.zeros((F * m, F * m))
+    for f in range(F):
+        dense[f * m : f * m + m, f * m : f * m + m] = own[f]
+    for f in range(F - 1):
+        dense[f * m : f * m + m, f * m + m : f * m + 2 * m] = after[f]
+        dense[f * m + m : f * m + 2 * m, f * m : f * m + m] = after[f].T
+    b = rng.normal(size=(F, m))
+    x = Tridiagonal.of(own.copy(), after).solve(b)
+    np.testing.assert_allclose(x.ravel(), np.linalg.solve(dense, b.ravel()), rtol=2e-4, atol=1e-6)
+
+
+def test_a_rigid_motion_of_all_nodes_is_the_cameras(body):
+    """What the whole body does in common leaves the nodes and enters the poses; measured points stay."""
+    graph = build_graph(body.vertices_m, body.triangles, 0.15)
+    rng = np.random.default_rng(1)
+    knots = np.array([0.0, 1.0, 2.0])
+    common = se3_exp(rng.normal(0, [0.02] * 3 + [0.01] * 3, (3, 6)))
+    there = np.stack([transform_points(T, graph.at_m) for T in common])
+    twist = np.concatenate([np.zeros_like(there), there - graph.at_m], axis=2)
+    field = MotionField(graph.at_m, knots, twist)
+    found = common_motion(field, np.ones(len(graph)))
+    np.testing.assert_allclose(found, common, atol=1e-9)
+    assert np.abs(without(field, found).twist[..., 3:]).max() < 1e-9
+    T = np.tile(np.eye(4), (3, 1, 1))
+    np.testing.assert_allclose(poses_without(field, found, knots, T), invert(common), atol=1e-12)
+
+
+def test_points_of_a_node_s_piece_move_rigidly_and_a_rigid_field_is_exact(body):
+    graph = build_graph(body.vertices_m, body.triangles, 0.15)
+    w, t = np.array([0.03, -0.02, 0.04]), np.array([0.004, 0.002, -0.003])
+    R = rotations(w[None])[0]
+    shift = graph.at_m @ R.T + t - graph.at_m
+    twist = np.concatenate([np.tile(w, (len(graph), 1)), shift], axis=1)
+    moved = body.vertices_m + displacement(body.vertices_m, graph.binding, graph.at_m, twist)
+    np.testing.assert_allclose(moved, body.vertices_m @ R.T.astype(np.float32) + t, atol=2e-6)
+    turned = moved_by(body, affine(graph.at_m, twist, graph.binding))
+    np.testing.assert_allclose(turned.normals, body.normals @ R.T.astype(np.float32), atol=2e-6)
+    again = bind(body.vertices_m, body.triangles, graph.at_m)
+    np.testing.assert_array_equal(again.node, graph.binding.node)
+
+
+def test_a_leaning_body_is_found_and_a_still_one_is_left_alone(body):
+    still, moving = recorded(body, 0.0), recorded(body, LEAN_DEG)
+    knots = np.linspace(0, 12, 19)
+    assert unrest(still, body, look_points(body, 0.025), knots, NOISE_M) < 0.6 * STILL
+    assert estimate(body, still, NOISE_M, lambda _: body) is None
+    found = estimate(body, moving, NOISE_M, lambda _: body)
+    assert found is not None
+    assert found.after < 0.8 * found.before
+    # in the world of the poses that were given, the surface stands where it stood, the far side of the walk included
+    top, error, size = body.vertices_m[:, 2] > 0.3, [], []
+    for i in range(5, len(moving), 5):
+        t, lean = moving.times_s[i], np.radians(LEAN_DEG) * np.sin(2 * np.pi * moving.times_s[i] / LEAN_S)
+        rest, field = found.surface.vertices_m, found.field
+        now = rest + displacement(rest, found.binding, field.node_m, field.at(t))
+        now = transform_points(invert(se3_exp(found.correction[i])), now.astype(np.float64))
+        truth = leaning(body, lean).vertices_m
+        error.append((now - truth)[top].mean(0))
+        size.append((truth - body.vertices_m)[top].mean(0))
+    error_m, size_m = (np.sqrt((np.var(x, axis=0)).sum()) for x in (error, size))
+    assert size_m > 0.007
+    assert error_m < 0.25 * size_m
+
+
+def test_frames_are_brought_to_rest(body):
+    """A body that leans is seen upright again, to the size of a pixel's slope; without motion nothing changes."""
+    camera = Camera(320, 240, np.array([[280.0, 0, 159.5], [0, 280, 119.5], [0, 0, 1]]))
+    graph = build_graph(body.vertices_m, body.triangles, 0.15)
+    T = walk(12.0, tremor=0.0).T_world_depth[10]
+    zero = MotionField.at_rest(graph.at_m, np.array([0.0, 1.0]))
+    rest = depth_of(body, camera, T)
+    same = Warp(RestSurface(body.vertices_m, body.triangles, graph.binding, zero), camera)(rest, T, 0.5)
+    np.testing.assert_allclose(same, rest, atol=1e-6)
+
+    twist = np.zeros((2, len(graph), 6))
+    twist[:, :, 3:] = [0.012, -0.008, 0.01]
+    field = zero.moved(twist)
+    moved = moved_by(body, affine(graph.at_m, field.at(0.5), graph.binding))
+    seen = depth_of(moved, camera, T)
+    back = Warp(RestSurface(body.vertices_m, body.triangles, graph.binding, field), camera)(seen, T, 0.5)
+    both = np.isfinite(back) & np.isfinite(rest)
+    assert both.sum() > 0.97 * np.isfinite(rest).sum()
+    assert np.nanmedian(np.abs(back - rest)) < 1e-3 < np.nanmedian(np.abs(seen - rest))
+
+
+def test_parts_are_named_by_place():
+    """A body that faces -y has its right hand at -x, whichever way the axes are turned."""
+    made = build_shape(ShapeConfig(kind="body", subdivisions=0))
+    turn = rotations(np.array([[0.3, -0.5, 2.0]]))[0]
+    mesh = SurfaceMesh((made.vertices_m @ turn.T).astype(np.float32), made.triangles.astype(np.int32), made.normals)
+    names, part = name_parts(mesh, turn @ np.array([0.0, 0.0, 1.0]))
+    middle = {n: made.vertices_m[part == k].mean(0) for k, n in enumerate(names)}
+    assert all((part == k).any() for k in range(len(names)))
+    for pair in ("hand", "forearm", "upper arm", "thigh", "shin", "foot"):
+        assert middle[f"right {pair}"][0] < -0.05 < 0.05 < middle[f"left {pair}"][0]
+    order = ("foot", "shin", "thigh")
+    assert all(middle[f"left {a}"][2] < middle[f"left {b}"][2] for a, b in pairwise(order))
+    assert middle["head"][2] > middle["chest"][2] > middle["belly"][2] > middle["pelvis"][2]
+    reach = [np.abs(middle[f"left {k}"][0]) for k in ("upper arm", "forearm", "hand")]
+    assert reach == sorted(reach)

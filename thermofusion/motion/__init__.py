@@ -1,0 +1,1 @@
+"""How the subject moved while it was recorded: rigid nodes along its surface, each with a motion over time."""
