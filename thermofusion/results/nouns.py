@@ -19,6 +19,25 @@ OLD_NAMES = MappingProxyType(
 )
 
 
+def _shape() -> dict[str, type]:
+    """Nouns of the surface and of its motion."""
+    from ..motion.body import BodyMotion, PartMotion
+    from ..motion.field import MotionField
+    from ..motion.graph import Binding
+    from ..surface.clean import RemovedPart
+    from ..surface.surface import SurfaceResult
+
+    return {
+        "binding/1": Binding,
+        "body-motion/1": BodyMotion,
+        "motion-field/1": MotionField,
+        "part-motion/1": PartMotion,
+        "removed-part/1": RemovedPart,
+        "surface/2": SurfaceResult,
+        "surface/1": SurfaceResult,  # without `motion`
+    }
+
+
 @cache
 def stored() -> MappingProxyType[str, type]:
     """Name and version -> class. A class whose fields change gets a new version; the old one stays, with its reader."""
@@ -26,13 +45,8 @@ def stored() -> MappingProxyType[str, type]:
     from ..mapping.motion import MotionResult
     from ..mapping.observe import Mapped
     from ..mapping.references import BlackbodyReading
-    from ..motion.body import BodyMotion, PartMotion
-    from ..motion.field import MotionField
-    from ..motion.graph import Binding
     from ..rig.align import RigResult
     from ..rig.free.place import FreeViews
-    from ..surface.clean import RemovedPart
-    from ..surface.surface import SurfaceResult
     from ..temperature.crosscal import Calibration
     from ..temperature.room.map import RoomMap
     from ..temperature.sensor.field import ImageField
@@ -53,10 +67,9 @@ def stored() -> MappingProxyType[str, type]:
 
     return MappingProxyType(
         {
+            **_shape(),
             "background/1": Background,
-            "binding/1": Binding,
             "blackbody-reading/1": BlackbodyReading,
-            "body-motion/1": BodyMotion,
             "calibration/1": Calibration,
             "camera/1": Camera,
             "free-views/1": FreeViews,
@@ -65,18 +78,13 @@ def stored() -> MappingProxyType[str, type]:
             "mapped/2": Mapped,
             "mapped/1": Mapped,  # without `background`
             "motion/1": MotionResult,
-            "motion-field/1": MotionField,
             "observations/1": Observations,
-            "part-motion/1": PartMotion,
-            "removed-part/1": RemovedPart,
             "rig/1": RigResult,
             "shared-errors/1": SharedErrors,
             "room-map/1": RoomMap,
             "sensor-pattern/1": Pattern,
             "signal-curve/1": SignalCurve,
             "surface-mesh/1": SurfaceMesh,
-            "surface/2": SurfaceResult,
-            "surface/1": SurfaceResult,  # without `motion`
             "temperature/3": Temperature,
             "temperature/2": Temperature,  # without `room`
             "temperature/1": Temperature,  # without `shared`
