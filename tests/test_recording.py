@@ -294,6 +294,16 @@ def test_a_devices_counter_wraps_in_mid_recording(tmp_path):
     assert np.diff(t) == pytest.approx(0.005, abs=1e-6)
 
 
+def test_a_silent_stream_is_said(tmp_path, monkeypatch):
+    class Stuck(Steady):
+        def read(self):
+            return super().read() if self._next < 5 else time.sleep(0.02) or []
+
+    monkeypatch.setattr(recorder, "SILENT_S", 0.3)
+    state = recorded(tmp_path / "rec", Stuck(), Steady("other", frames=20), until=Until(seconds=1.5))
+    assert state.problems == ["steady/depth: no frame for 0.3 s"]
+
+
 def test_a_ring_that_is_full_drops_and_counts_and_never_waits():
     class Slow(Steady):
         def read(self):
@@ -465,3 +475,55 @@ def test_a_device_whose_process_dies_is_said(tmp_path):
     worker.end()
     assert recorder.FILE == "recording.mcap"
     shutil.rmtree(tmp_path)
+
+
+def test_a_fakenect_folder_plays_as_a_kinect(tmp_path):
+    from thermofusion.recording.replay import open_replay
+
+    taken = tmp_path / "taken"
+    taken.mkdir()
+    frames = [((np.arange(480 * 640) * 3 + 7 * k) % 2048).astype("<u2") for k in range(3)]
+    lines = [f"d-{1000 + k / 30:.6f}-{(2**32 - 3_000_000 + 2_000_000 * k) % 2**32}.pgm" for k in range(3)]
+    (taken / "INDEX.txt").write_text("\n".join(lines) + "\n")
+    for line, frame in zip(lines, frames, strict=True):
+        (taken / line).write_bytes(b"P5 640 480 65535\n" + frame.tobytes())
+    opener = partial(open_replay, taken, ("depth", "color"), time.monotonic_ns(), 100.0, None)
+    record([opener], tmp_path / "rec", Until(), own_process=False)
+    old, new = open_scan(taken), open_scan(tmp_path / "rec")
+    index = scan_mcap(tmp_path / "rec" / "recording.mcap")
+    assert "kinect/disparity" in {c.topic for c in index.channels.values()}
+    np.testing.assert_allclose(new.depth.times_s - new.depth.times_s[0], old.depth.times_s, atol=1e-6)
+    for k in range(3):
+        np.testing.assert_array_equal(old.depth.load(k), new.depth.load(k))
+
+
+def test_verbs_without_a_camera_say_so(tmp_path, monkeypatch):
+    from thermofusion.recording import devices
+
+    monkeypatch.setattr(devices, "cameras", list)
+    answer = CliRunner().invoke(app, ["devices", "--json"])
+    assert json.loads(answer.output) == {"devices": []}
+    with pytest.raises(ResourceError, match="no camera known to thermofusion is on the USB bus; plug one in"):
+        CliRunner().invoke(app, ["record", "-o", str(tmp_path / "x")], catch_exceptions=False)
+    assert not (tmp_path / "x").exists()
+    rules = tmp_path / "60-thermofusion.rules"
+    CliRunner().invoke(app, ["doctor", "--udev", str(rules)], catch_exceptions=False)
+    text = rules.read_text()
+    for (vendor, product), name in devices.KNOWN.items():
+        assert f"# {name}\n" in text
+        ids = f'ATTRS{{idVendor}}=="{vendor:04x}", ATTRS{{idProduct}}=="{product:04x}"'
+        assert f'SUBSYSTEM=="usb", {ids}, MODE="0660", TAG+="uaccess"' in text
+
+
+def test_the_terminal_shows_what_a_person_must_see(tmp_path):
+    from thermofusion.cli.record import state_lines
+
+    warm = {"curve": {"gain_K": 1 / 64, "offset_K": 0.0}}
+    shown = []
+    device = Steady("cam", kind="thermal", frames=200, signal=warm)
+    recorded(tmp_path / "rec", device, Steady(unplug_at=30), status=lambda s: shown.append(state_lines(s)))
+    last = "\n".join(shown[-1])
+    middle = np.median(pixels(199)[20:28, 28:36]) / 64 - 273.15
+    assert re.search(rf"cam/thermal: \d+\.\d Hz, 200 frames, 0 lost, middle {middle:.1f} °C", last), last
+    assert "problem: steady: the device has gone from the bus" in last
+    assert "GiB free" in shown[0][0]

@@ -89,6 +89,39 @@ def test_kinect_frames_come_bit_for_bit_through_libusb(kinect, tmp_path):
         assert seen["kinect_gravity"].view(np.float64)[0].tolist() == [0, 1, 0]
 
 
+UNPLUGGED = """
+import sys, time
+from thermofusion.recording.device import UnpluggedError
+from thermofusion.recording.devices import cameras
+device = cameras()[0].open()
+if hasattr(device, "_wait"):
+    device._wait = lambda seconds: None
+device.start()
+whole, until = 0, time.monotonic() + 20
+try:
+    while time.monotonic() < until:
+        whole += sum(f.stream == 0 for f in device.read())
+except UnpluggedError as e:
+    begun = time.monotonic()
+    device.stop()
+    print(whole, round(time.monotonic() - begun, 1), e)
+"""
+
+
+@pytest.mark.parametrize("kind", ["kinect", "p3"])
+def test_unplugged_in_mid_frame_is_said_and_ends(kind, kinect, tmp_path):
+    for name in ("depth.bin", "video.bin"):
+        (tmp_path / name).symlink_to(kinect[0] / name)
+    camera = fake_usb.SimulatedP3()
+    (tmp_path / "stream.bin").write_bytes(b"".join(camera._bytes() for _ in range(FRAMES)))
+    (tmp_path / "unplug").write_text("60")
+    answer = beside(kind, tmp_path, sys.executable, "-c", UNPLUGGED)
+    whole, stopping_s, said = answer.stdout.split(" ", 2)
+    assert "the device has gone from the bus" in said
+    assert 0 < int(whole) < FRAMES
+    assert float(stopping_s) < 2
+
+
 def test_libfreenect_sees_the_same_depth(kinect, tmp_path):
     if shutil.which("fakenect-record") is None:
         pytest.skip("fakenect-record is not installed (apt install libfreenect-bin)")

@@ -61,12 +61,25 @@ H: descriptors={hexed}
 """
 
 
-class Kinect:
+class Camera:
+    """What all have in common. transfers : of frames, after which it is unplugged; from DATA/unplug."""
+
+    def __init__(self, data):
+        unplug = data / "unplug"
+        self.transfers = int(unplug.read_text()) if unplug.exists() else sys.maxsize
+
+    def running(self):
+        """Whether its start is over: a node that is polled here never says POLLERR, so that a request would hang."""
+        return True
+
+
+class Kinect(Camera):
     """Commands with replies; packets of 1748 and 1908 bytes once depth or video are started."""
 
     text = described(0x045E, 0x02AE, 267, [(0, 0, [(0x81, 1, 1920), (0x82, 1, 1760)])])
 
     def __init__(self, data):
+        super().__init__(data)
         self.registers, self.reply, self.begun = {}, b"", {}
         self.packets = {
             0x82: self._packets(data / "depth.bin", 422_400, 1748, 0x70),
@@ -83,6 +96,9 @@ class Kinect:
                 out.append(struct.pack("<2s6BI", b"RB", 0, kind | step, 0, sequence & 255, 0, 0, 2_000_000 * k) + piece)
                 sequence += 1
         return out
+
+    def running(self):
+        return 0x47 in self.registers and not self.reply
 
     def control(self, setup, data):
         if setup[0] == 0x40:
@@ -114,7 +130,7 @@ class Kinect:
         return [queue.popleft() if queue else b"" for _ in range(count)]
 
 
-class Motor:
+class Motor(Camera):
     """The motor of a model 1414: level, at rest."""
 
     text = described(0x045E, 0x02B0, 0x105, [(0, 0, [])], address=4)
@@ -123,12 +139,13 @@ class Motor:
         return struct.pack(">2xhhhbB", 0, 819, 0, 0, 0) if setup[0] & 0x80 else b""
 
 
-class P3:
+class P3(Camera):
     """Commands are taken; bulk bytes once it was started twice."""
 
     text = described(0x3474, 0x45A2, 0x100, [(0, 0, []), (1, 0, []), (1, 1, [(0x81, 2, 512)])])
 
     def __init__(self, data):
+        super().__init__(data)
         self.left, self.starts = (data / "stream.bin").read_bytes(), 0
 
     def control(self, setup, data):
@@ -149,6 +166,7 @@ class Bus:
 
     def __init__(self, camera):
         self.camera, self.waiting, self.done = camera, [], deque()
+        self.left = camera.transfers  # until it is unplugged
 
     def __call__(self, _, client):
         request, arg = client.get_request() & 0xFFFFFFFF, client.get_arg()
@@ -157,6 +175,8 @@ class Bus:
         return True
 
     def answer(self, request, arg):
+        if self.left <= 0:
+            return -1, errno.ENODEV
         if request == CAPABILITIES:
             arg.resolve(0, 4).update(0, list(struct.pack("<I", 0)))
             return 0, 0
@@ -218,6 +238,7 @@ class Bus:
             urb.update(28, list(struct.pack("<i", actual)))
             del self.waiting[row]
             self.done.append(urb)
+            self.left -= kind != CONTROL and self.camera.running()
             return
 
     @staticmethod
@@ -247,7 +268,7 @@ class Bus:
 def main(kind, data, *command):
     """Run the command beside the camera; its exit code."""
     bed = UMockdev.Testbed.new()
-    devices = {"kinect": lambda: [Kinect(Path(data)), Motor()], "p3": lambda: [P3(Path(data))]}[kind]()
+    devices = {"kinect": lambda: [Kinect(Path(data)), Motor(Path("/nowhere"))], "p3": lambda: [P3(Path(data))]}[kind]()
     handlers = []  # kept: the testbed does not
     for device in devices:
         bed.add_from_string(device.text)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import select
+import signal
 import sys
 import time
 from collections.abc import Iterator
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from ..errors import RecipeError, counted
+from ..errors import RecipeError, ResourceError, counted
 from .console import emit, named, note
 from .options import Json, spelled_out
 
@@ -88,6 +89,9 @@ def record(
     from ..recording.record import record as into
 
     named(out)
+    for word in ("SIGTERM", "SIGHUP"):  # a shutdown, a terminal that is closed: they end it as Ctrl-C does
+        if hasattr(signal, word):
+            signal.signal(getattr(signal, word), signal.default_int_handler)
     openers, said, rig = _opened(sources, room)
     shown = _Shown(json)
     with _keys(ends.wait) as control:
@@ -121,7 +125,7 @@ def _opened(sources: Sources, room: Room) -> tuple[list[Callable[[], Device]], d
         found = chosen(sources.device or [], cameras())
         if not found:
             hint = "plug one in, or give --from SCAN; `thermofusion doctor` says what the bus shows"
-            raise RecipeError("no camera known to thermofusion is on the USB bus", hint=hint)
+            raise ResourceError("no camera known to thermofusion is on the USB bus", hint=hint)
         video: Literal["color", "infrared"] = "infrared" if sources.infrared else "color"
         return [partial(open_camera, f.ids, f.bus, f.address, video) for f in found], {"environment": environment}, rig
     from ..recording.replay import playing

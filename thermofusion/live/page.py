@@ -45,23 +45,18 @@ class Page:
         self._server.server_close()
 
     def _handler(self) -> type[BaseHTTPRequestHandler]:
-        answers = self._answers
+        def answer(request: BaseHTTPRequestHandler) -> None:
+            kind, data = self._answers.get(request.path, ("", b""))
+            request.send_response(200 if kind else 404)
+            request.send_header("Content-Type", kind or "text/plain")
+            request.send_header("Content-Length", str(len(data)))
+            request.send_header("Content-Security-Policy", POLICY)
+            request.send_header("Cache-Control", "no-store")
+            request.end_headers()
+            request.wfile.write(data)
 
-        class Handler(BaseHTTPRequestHandler):
-            def do_GET(self) -> None:
-                kind, data = answers.get(self.path, ("", b""))
-                self.send_response(200 if kind else 404)
-                self.send_header("Content-Type", kind or "text/plain")
-                self.send_header("Content-Length", str(len(data)))
-                self.send_header("Content-Security-Policy", POLICY)
-                self.send_header("Cache-Control", "no-store")
-                self.end_headers()
-                self.wfile.write(data)
-
-            def log_message(self, *_: object) -> None:
-                """Say nothing on the terminal."""
-
-        return Handler
+        quiet = {"log_message": lambda *_: None}  # nothing on the terminal
+        return type("Handler", (BaseHTTPRequestHandler,), {"do_GET": answer, **quiet})
 
 
 def _page() -> bytes:

@@ -29,6 +29,7 @@ FLUSH_S = 0.4  # what is in memory is written at least so often: with 0.1 s of p
 RESERVE_BYTES = 32 * 2**20  # of free disk: a recording stops before, while there is room for its end
 POLL_S = 0.05
 STOP_S = 4.0  # devices are asked to stop, and their last frames awaited, for so long
+SILENT_S = 5.0  # a stream that began and gives nothing for so long is said
 RATE_S = 2.0  # over which a rate is taken
 MANY = 64  # frames of one device in a row before the others have their turn
 Control = Callable[[], str | None]  # "stop", "shutter", "start" or None: asked often
@@ -44,6 +45,7 @@ class StreamState:
     frames: int = 0
     lost: int = 0
     shutter: bool = False
+    live: bool = True  # its device has not ended
     last: bytes | None = None
     arrivals_ns: list[int] = field(default_factory=list)
 
@@ -149,6 +151,7 @@ class _Recorder:
         self._disk = _Disk(self._writer.fileno())
         self._flushed_at = self._shown_at = self._checked_at = 0.0
         self._corrected_at = time.monotonic()
+        self._silent: set[str] = set()
 
     def start(self, workers: Sequence[Worker]) -> None:
         """Take over devices that are being started."""
@@ -225,8 +228,8 @@ class _Recorder:
 
     def _ended(self, row: int, said: Ended) -> None:
         del self._workers[row]
-        for sink, number in zip(self._sinks.get(row, []), said.numbers, strict=False):
-            sink.ended(number)
+        for k, sink in enumerate(self._sinks.get(row, [])):
+            sink.ended(said.numbers[k] if k < len(said.numbers) else 0)
         if said.problem is not None:
             self.state.problems.append(said.problem)
 
@@ -251,6 +254,7 @@ class _Recorder:
             self._checked_at = now
             if shutil.disk_usage(self.state.folder).free < RESERVE_BYTES:
                 self._full(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
+        self._listen(time.monotonic_ns())
         every = self._until.shutter_every_s
         if every is not None and now - self._corrected_at >= every:
             self._corrected_at = now
@@ -260,6 +264,14 @@ class _Recorder:
             self.state.size_bytes = self._writer.size + self._writer.waiting
             self.state.seconds = (time.monotonic_ns() - self._begin_ns) * 1e-9 if self.state.started else 0.0
             status(self.state)
+
+    def _listen(self, now_ns: int) -> None:
+        """Say once of a stream that it has been silent for long; its device may hang."""
+        for name, stream in self.state.streams.items():
+            silent = stream.arrivals_ns and now_ns - stream.arrivals_ns[-1] > SILENT_S * 1e9
+            if silent and name not in self._silent and stream.live:
+                self._silent.add(name)
+                self.state.problems.append(f"{name}: no frame for {SILENT_S:g} s")
 
     def _enough(self) -> bool:
         depth = [s.frames + s.lost for s in self.state.streams.values() if s.info.kind == "depth"]
@@ -335,6 +347,7 @@ class _Sink:
 
     def ended(self, number: int) -> None:
         """The stream has ended with so many frames: what was lost behind the last one."""
+        self._state.live = False
         if self._first is not None:
             self._state.lost += max(number - self._first - self._next, 0)
 

@@ -11,8 +11,8 @@ import pickle
 import signal
 import struct
 import threading
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
@@ -122,6 +122,19 @@ class _Sender:
         self._pipe.send_bytes(_FRAME.pack(_IS_FRAME, *fields, frame.shutter, frame.fpa_degC))
 
 
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """A process that is started here is deaf to Ctrl-C from its first moment on."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 class Worker:
     """The recorder's end: starts the device, hands out what comes, stops it. own_process : False = a thread."""
 
@@ -133,7 +146,8 @@ class Worker:
         self._runs: Any
         if own_process:
             self._runs = context.Process(target=serve, args=arguments, daemon=True)
-            self._runs.start()
+            with _deaf():
+                self._runs.start()
             theirs.close()
         else:
             self._runs = threading.Thread(target=serve, args=arguments, daemon=True)

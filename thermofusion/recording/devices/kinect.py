@@ -24,6 +24,7 @@ MOTOR, AUDIO = (0x045E, 0x02B0), (0x045E, 0x02AD)
 MODEL_1414 = 267  # bcdDevice of a camera whose motor device works
 DEPTH_ENDPOINT, VIDEO_ENDPOINT = 0x82, 0x81
 TILT_EVERY_S = 0.5
+SILENT_S = 1.0  # without a packet for so long, it is asked whether it is still there
 REPLY_S = 1.0  # time for a camera's reply
 MAX_POLLS = 200  # of a reply, whatever the clock does
 RATE_HZ = 30.0
@@ -129,7 +130,7 @@ class Kinect:
         self._motor = None if motor is None else Motor(motor)
         self._make_packets = packets or (lambda: IsoQueue(device, (DEPTH_ENDPOINT, VIDEO_ENDPOINT)))
         self._packets: PacketSource | None = None
-        self._tag, self._tilt_at = 0, 0.0
+        self._tag, self._tilt_at, self._heard_at = 0, 0.0, time.monotonic()
         size = wire.BAYER_BYTES if video == "color" else wire.INFRARED_BYTES
         self._depth = wire.Assembler(wire.DEPTH, wire.DEPTH_BYTES, wire.DEPTH_PAYLOAD)
         self._second = wire.Assembler(wire.VIDEO, size, wire.VIDEO_PAYLOAD)
@@ -151,7 +152,9 @@ class Kinect:
         """The frames that arrived. Raises UnpluggedError."""
         assert self._packets is not None
         frames = []
-        for packet in self._packets.take(POLL_S):
+        packets = self._packets.take(POLL_S)
+        self._listen(bool(packets))
+        for packet in packets:
             row, assembler = (0, self._depth) if packet.endpoint == DEPTH_ENDPOINT else (1, self._second)
             whole = assembler.feed(packet.data)
             if whole is not None:
@@ -174,6 +177,15 @@ class Kinect:
         if self._motor is not None:
             self._motor.close()
         self._usb.release()
+
+    def _listen(self, heard: bool) -> None:
+        """Ask a camera that has been silent whether it is still there. Raises UnpluggedError."""
+        now = time.monotonic()
+        if heard:
+            self._heard_at = now
+        elif now - self._heard_at > SILENT_S:
+            self._heard_at = now
+            self._usb.read(0x40, 0x00, length=512)
 
     def _pixels(self, row: int, data: bytes) -> bytes:
         if row == 1 and self._video == "color":
