@@ -121,7 +121,7 @@ class Kinect(Camera):
         """Up to `count` packets; None while it does not stream, or is at its end."""
         on = self.registers.get(0x06) == 2 if endpoint == 0x82 else self.registers.get(0x05) in (1, 3)
         queue = self.packets[endpoint]
-        if not on or not queue:
+        if not on or not queue or 0x47 not in self.registers:  # it streams once its whole start was ordered
             return None
         begun, total = self.begun.setdefault(endpoint, (time.monotonic(), len(queue)))
         due = (time.monotonic() - begun) * RATE_HZ * (242 if endpoint == 0x82 else 162)
