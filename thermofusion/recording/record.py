@@ -27,7 +27,7 @@ from .worker import Delivered, Ended, Started, Worker
 FILE = "recording.mcap"
 FLUSH_S = 0.4  # what is in memory is written at least so often: with 0.1 s of polling, half a second
 RESERVE_BYTES = 32 * 2**20  # of free disk: a recording stops before, while there is room for its end
-POLL_S = 0.05
+POLL_S = 0.05  # the longest that keys and the clock wait
 STOP_S = 4.0  # devices are asked to stop, and their last frames awaited, for so long
 SILENT_S = 5.0  # a stream that began and gives nothing for so long is said
 RATE_S = 2.0  # over which a rate is taken

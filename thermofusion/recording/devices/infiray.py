@@ -22,12 +22,12 @@ from .marks import ShutterMarks
 
 MODELS = {(0x3474, 0x45A2): ("Thermal Master P3", 256, 192), (0x3474, 0x45C2): ("Thermal Master P1", 160, 120)}
 MARKER = struct.Struct("<BBIIH")  # its length, sync, frame count, time count, counter
-SYNC = (0x8C, 0x8D, 0x8E, 0x8F)
+SYNC = (0x8C, 0x8D, 0x8E, 0x8F)  # a marker's second byte
 _MARK = re.compile(rb"\x0c[\x8c-\x8f]")
 COUNT_WRAP = 2048  # of the third counter, which steps by 40 a frame
 COUNT_INVERSE = 205  # 5 * 205 = 1 modulo 256: a step of 40 modulo 2048 is one of 5 modulo 256
 ENDPOINT, READ_BYTES = 0x81, 16_384
-RATE_HZ = 25.0
+RATE_HZ = 25.0  # as its makers say
 START_WAITS_S = (1.0, 2.0)  # after the first start, after the vendor's request
 SIGNAL = {"kind": "counts", "curve": {"type": "linear_kelvin", "gain_K": 1 / 64, "offset_K": 0.0}}
 

@@ -23,11 +23,11 @@ CAMERAS = {(0x045E, 0x02AE): "Kinect v1", (0x045E, 0x02BF): "Kinect for Windows 
 MOTOR, AUDIO = (0x045E, 0x02B0), (0x045E, 0x02AD)
 MODEL_1414 = 267  # bcdDevice of a camera whose motor device works
 DEPTH_ENDPOINT, VIDEO_ENDPOINT = 0x82, 0x81
-TILT_EVERY_S = 0.5
+TILT_EVERY_S = 0.5  # a rig that is carried turns slowly
 SILENT_S = 1.0  # without a packet for so long, it is asked whether it is still there
 REPLY_S = 1.0  # time for a camera's reply
 MAX_POLLS = 200  # of a reply, whatever the clock does
-RATE_HZ = 30.0
+RATE_HZ = 30.0  # of both streams
 COLOR_F_PX = 525.0  # nominal: a rig.json replaces it
 LED_OFF, LED_GREEN, LED_RED = 0, 1, 2
 

@@ -21,9 +21,9 @@ from ..usb import RefusedWriteError
 from .marks import ShutterMarks
 from .v4l2 import Capture, VideoNode, node_of
 
-IDS = (0x1E4E, 0x0100)
+IDS = (0x1E4E, 0x0100)  # vendor, product
 WIDTH_PX, HEIGHT_PX, TELEMETRY_ROWS = 160, 120, 2
-RATE_HZ = 8.7
+RATE_HZ = 8.7  # of new pictures: export rules
 SIGNAL = {"kind": "counts", "curve": {"type": "linear_kelvin", "gain_K": 0.01, "offset_K": 0.0}}
 OEM, RAD, SYS = 4, 5, 6  # extension units; a command's control is its number's low byte / 4 + 1
 RUN_FFC = (SYS, (0x42 >> 2) + 1, b"\x00")
@@ -52,7 +52,7 @@ class TelemetryReader:
         self._before: tuple[int, int] | None = None
 
     def read(self, row: NDArray[np.uint16]) -> Telemetry | None:
-        """row : (N,) words. None where it is too short, or no telemetry (its sensor temperature is absurd)."""
+        """row : (N,) 16-bit numbers. None where it is too short, or no telemetry (its sensor temperature is absurd)."""
         if len(row) < 25 or not ABSURD_K100[0] <= int(row[24]) <= ABSURD_K100[1]:
             return None
         both = _pair(row, 1, 0), _pair(row, 1, 1)

@@ -17,10 +17,10 @@ from .infiray import SIGNAL
 from .marks import ShutterMarks
 from .v4l2 import Capture, VideoNode, node_of
 
-IDS = (0x0BDA, 0x5830)
+IDS = (0x0BDA, 0x5830)  # vendor, product
 WIDTH_PX, HEIGHT_PX = 256, 192
 FRAME_BYTES = WIDTH_PX * 2 * HEIGHT_PX * 2
-RATE_HZ = 25.0
+RATE_HZ = 25.0  # as its makers say
 NEVER = (0x0805, 0x8201)  # vendor commands that make the camera unusable: reset into its loader, its flash
 
 

@@ -24,7 +24,7 @@ LEVEL = 0x4000  # of a picture that equals the shutter's
 PLATFORM, MODE, FIRMWARE, CHIP, FEATURES, SETTINGS, PROCESSING, GET_IMAGE = 84, 60, 78, 54, 86, 88, 62, 83
 IDLE, RUN, PLAIN = b"\x00\x00", b"\x01\x00", b"\x08\x00"
 SETTLING = 1  # pictures after the shutter that are marked
-ENDPOINT = 0x81
+ENDPOINT = 0x81  # bulk, of frames
 
 
 @dataclass(frozen=True)
