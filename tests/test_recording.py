@@ -413,6 +413,9 @@ def test_a_scan_played_as_devices_is_the_same_scan(tmp_path):
         np.testing.assert_allclose(a.times_s - old.depth.times_s[0], b.times_s - new.depth.times_s[0], atol=2e-6)
     np.testing.assert_array_equal(old.thermal.camera.T_thermal_depth, new.thermal.camera.T_thermal_depth)
     assert new.environment.reflected_degC == old.environment.reflected_degC
+    blackbodies = [r for r in old.references if r.kind == "blackbody"]
+    assert [(r.degC, r.frames) for r in new.references] == [(r.degC, r.frames) for r in blackbodies]
+    assert blackbodies
     again = CliRunner().invoke(app, [*arguments[:2], str(tmp_path / "rec"), *arguments[3:4], str(tmp_path / "again")])
     assert again.exit_code == 0, again.output
     np.testing.assert_array_equal(open_scan(tmp_path / "again").depth.load(1), old.depth.load(1))

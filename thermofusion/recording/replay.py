@@ -110,7 +110,16 @@ def playing(path: Path, speed: float = 1.0, format: str | None = None) -> Playin
     rig = {k: document[k] for k in ("cameras", "extrinsics")} if scan.format != "recording" else _rig_beside(path)
     streams = {kind: getattr(scan, kind) for kind in ("depth", "color", "thermal")}
     counts = {kind: len(s) for kind, s in streams.items() if s is not None}
-    return Playing(openers, {"environment": document["environment"]}, rig, counts)
+    said = {"environment": document["environment"], "references": _references(scan, document["references"])}
+    return Playing(openers, said, rig, counts)
+
+
+def _references(scan: Scan, rows: list[dict]) -> list[dict]:
+    """Blackbodies, their frames as numbers in the stream; points on the skin stand in a world that is not recorded."""
+    index = [] if scan.thermal is None else scan.thermal.index.tolist()
+    place = {number: k for k, number in enumerate(index)}
+    known = [r for r in rows if r["kind"] == "blackbody"]
+    return [r | {"frames": [place[n] for n in r["frames"] if n in place]} for r in known]
 
 
 def _rig_beside(path: Path) -> dict[str, object] | None:

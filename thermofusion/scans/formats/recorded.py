@@ -25,7 +25,7 @@ from ...files.reading import COPY_AGAIN, MAX_PIXELS, open_regular, read_head
 from ...files.ros import FRAME_INFO, IMAGE, VECTOR, FrameInfo, Picture, read_frame_info, read_picture, read_vector
 from ...files.strict import validated
 from ...geometry.rigid import pose
-from ...types import Camera, Environment, Float, Scan, Stream, ThermalCamera
+from ...types import Camera, Environment, Float, Reference, Scan, Stream, ThermalCamera
 from ..clock import ClockFit, fit_clock
 from ..common import Kind, as_thermal, make_camera, make_rig, make_stream
 from ..native.compose import with_rig
@@ -126,7 +126,9 @@ def _scan_of(index: McapIndex, path: Path, stated: Stated, infos: dict[int, Fram
     )
     if kinds["color"]:
         scan = _with_color(scan, file, kinds["color"][0], clocks, stated)
-    return _with_thermal(scan, file, kinds["thermal"][0], clocks, stated) if kinds["thermal"] else scan
+    if kinds["thermal"]:
+        scan = _with_thermal(scan, file, kinds["thermal"][0], clocks, stated)
+    return replace(scan, references=_references(said.get("references", "[]"), scan, file))
 
 
 def _environment(text: str) -> Environment:
@@ -135,6 +137,20 @@ def _environment(text: str) -> Environment:
     except (ValueError, TypeError, AttributeError):
         return Environment()
     return Environment(**given)
+
+
+def _references(text: str, scan: Scan, file: Path) -> tuple[Reference, ...]:
+    """The blackbodies that were stated on recording; `frames` are numbers of thermal frames. Raises ScanError."""
+    from ..native.schema import BlackbodyDoc, reference_of
+
+    try:
+        rows = json.loads(text)
+    except ValueError:
+        rows = []
+    if scan.thermal is None or not isinstance(rows, list):
+        return ()
+    docs = [validated(BlackbodyDoc, row, file) for row in rows]
+    return tuple(reference_of(d, f"references.{i}", scan.thermal.camera.lens, file) for i, d in enumerate(docs))
 
 
 # ---------------------------------------------------------------- streams
