@@ -478,3 +478,30 @@ def test_skin_that_sees_skin_is_not_biased(tmp_path):
     assert cavity.sum() > 500
     assert abs(np.median(error[cavity])) < 0.1
     assert abs(error[cavity].mean()) < 0.1
+
+
+def test_a_standing_body_moves_about_its_rest():
+    """The soles stay, the chest sways by what was asked for, rest is the mean, hands move most against the trunk."""
+    living = scene(shape={"subdivisions": 0}, walk={"depth_frames": 300}, motion={"standing": "quiet", "step_mm": 50.0})
+    phantom = build_phantom(living)
+    posture, mesh, times = phantom.posture, phantom.mesh, phantom.depth_times_s
+    at = np.array([posture.at(t) for t in times])
+    moved = at - mesh.vertices_m
+    z, x = mesh.vertices_m[:, 2], mesh.vertices_m[:, 0]
+    still = (z < 0.04) & (x < -0.02)
+    assert np.abs(moved[:, still]).max() < 1e-6
+    back = (np.abs(z - 1.25) < 0.05) & (mesh.vertices_m[:, 1] > 0.03) & (np.abs(x) < 0.1)
+    sway = np.sqrt((moved[:, back].mean(1)[:, :2] ** 2).sum(1).mean())
+    assert sway == pytest.approx(0.006, rel=0.35)  # 20 s hold few periods of the slowest sines
+    assert np.abs(moved.mean(0)).max() < 1e-3
+    foot = (z < 0.04) & (x > 0.02)
+    aside = moved[-1, foot, 0].mean() - moved[0, foot, 0].mean()
+    assert aside == pytest.approx(0.05, rel=0.1)
+    truth = posture.truth(times[::10])
+    rms = dict(zip(truth["part_names"], truth["part_motion_rms_mm"], strict=True))
+    assert max(rms["chest"], rms["pelvis"]) < 2 < 3 < min(rms["left hand"], rms["right hand"])
+
+
+def test_only_a_body_can_stand_alive():
+    with pytest.raises(RecipeError, match=r"need shape\.kind = body"):
+        build_phantom(scene(shape={"kind": "sphere"}, motion={"standing": "tired"}))

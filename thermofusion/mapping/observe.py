@@ -115,6 +115,7 @@ class Mapped:
     jitter_s : one sigma of what single thermal frames' stamps lacked and was put right. depth_scale : depth over truth
     less 1, as outlines ask for it, 0 = no news.
     background : what the views show of the room; None in results of earlier versions.
+    unsettled : (V,) vertices whose motion was not followed; (0,) for a subject that stood still.
     """
 
     views: ThermalViews
@@ -127,6 +128,7 @@ class Mapped:
     jitter_s: float = 0.0
     depth_scale: float = 0.0
     background: Background | None = None
+    unsettled: Bool = field(default_factory=lambda: np.zeros(0, bool))
 
     __repr__ = brief
 
@@ -166,7 +168,8 @@ def observe(
     uv = np.argwhere(bad)[:, ::-1].astype(np.int32)
     background = find_background(stream, surface, views, converter, scan.references)
     left = rig.residual_px_after, rig.jitter_s, rig.depth_scale
-    return Mapped(views, left_out, observations, blackbodies, motion, uv, *left, background)
+    unsettled = np.zeros(0, bool) if body is None else body.unsettled
+    return Mapped(views, left_out, observations, blackbodies, motion, uv, *left, background, unsettled)
 
 
 def observe_views(

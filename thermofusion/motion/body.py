@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..types import Float, Float32, SurfaceMesh, Trajectory, brief
+from ..types import Bool, Float, Float32, SurfaceMesh, Trajectory, brief
 from .field import MotionField, affine
 from .graph import Binding
 
@@ -26,7 +26,8 @@ class BodyMotion:
     """How the subject moved against its trunk while it was recorded; the surface is at rest, the mean over time.
 
     field : of nodes along the surface. binding : of the surface's vertices. trajectory : of the depth camera against
-    the trunk. moved_mm : (V,) rms of each vertex. parts : by place.
+    the trunk. moved_mm : (V,) rms of each vertex. unsettled : (V,) its motion was not followed to the noise.
+    parts : by place.
     left_out_before, _after : rms, in sigmas, of depth frames that were left out,
     without and with motion. too_much : (start, stop) s in which the subject moved more than can be followed.
     """
@@ -35,6 +36,7 @@ class BodyMotion:
     binding: Binding
     trajectory: Trajectory
     moved_mm: Float32
+    unsettled: Bool
     parts: tuple[PartMotion, ...]
     left_out_before: float
     left_out_after: float

@@ -17,12 +17,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..geometry.rigid import invert, se3_exp, se3_log
-from ..types import Float, Int, SurfaceMesh
+from ..types import Float, Float32, Int, SurfaceMesh
 from .field import BoundPoints, MotionField, affine, carried, displacement
 from .gauge import common_motion, poses_without, unsteady, without
 from .graph import Binding, NodeGraph, bind, build_graph, cells
 from .rest import unrest
-from .rows import CORRELATED, CoarseFrames, Normal, gather, jacobian, left_over
+from .rows import CORRELATED, CoarseFrames, LeftOver, Normal, gather, jacobian, left_over
 from .solve import edge_matrix, held_matrix, solve_motion, step_weights
 
 SPACING_M = 0.15  # of nodes: rigid pieces of this size leave 0.34 mm of a body's sway, breath and drifting arms
@@ -42,14 +42,16 @@ MAX_SHIFT_M = 0.01  # of a point along its normal, at once
 @dataclass(frozen=True, eq=False)
 class Solution:
     """A motion. field : of the nodes. surface : that it was found on, at rest, and the binding of its vertices.
-    correction : (N, 6) left twists of the frames' poses. before, after : rms, in sigmas, of frames left out."""
+    correction : (N, 6) left twists of the frames' poses. before, after : what frames left out leave (rms, in sigmas).
+    point_m : (P, 3) points at rest that `after` speaks of."""
 
     field: MotionField
     surface: SurfaceMesh
     binding: Binding
     correction: Float
     before: float
-    after: float
+    after: LeftOver
+    point_m: Float32
 
     def poses(self, kept_s: Float, times_s: Float, T_world_depth: Float) -> Float:
         """Poses (N, 4, 4) at times_s (N,), corrected as those of the frames at kept_s (M,) were."""
@@ -73,11 +75,11 @@ def estimate(
     state = _State.of(mesh, graph, MotionField.at_rest(graph.at_m, knots), frames)
     held_out = range(LEFT_OUT - 1, len(frames), LEFT_OUT)
     rows = [i for i in range(len(frames)) if i not in held_out]
-    before = left_over(frames, held_out, state.points, state.field, noise_m_at_1m)
+    before = left_over(frames, held_out, state.points, state.field, noise_m_at_1m).rms
     for reach, kernel in SMEARED_M:
         state = state.improved(rows, reach, kernel, noise_m_at_1m)
     after = left_over(state.frames, held_out, state.points, state.field, noise_m_at_1m)
-    if not after < (1 - MIN_GAIN) * before:
+    if not after.rms < (1 - MIN_GAIN) * before:
         return None
     sharp = fused(state.solution(frames, before, after))
     graph = replace(graph, at_m=state.field.node_m, binding=bind(sharp.vertices_m, sharp.triangles, state.field.node_m))
@@ -121,13 +123,13 @@ class _State:
         area: Float = np.bincount(carried_by, share, len(graph)).astype(np.float64)
         return cls(mesh, graph, points, field, frames, np.zeros((len(graph), 6)), area)
 
-    def solution(self, start: CoarseFrames, before: float, after: float) -> Solution:
+    def solution(self, start: CoarseFrames, before: float, after: LeftOver) -> Solution:
         """As it stands; `start` holds the poses that it began with."""
         graph = self.graph
         rest = self.mesh.vertices_m + displacement(self.mesh.vertices_m, graph.binding, graph.at_m, self.moved)
         surface = replace(self.mesh, vertices_m=rest.astype(np.float32))
         correction = se3_log(self.frames.T_world_depth @ invert(start.T_world_depth))
-        return Solution(self.field, surface, graph.binding, correction, before, after)
+        return Solution(self.field, surface, graph.binding, correction, before, after, self.points.at_m)
 
     def improved(self, rows: Sequence[int], reach_m: float, kernel_m: float, noise_m_at_1m: float) -> _State:
         """After one Gauss-Newton step of motion, shape, and jitter of the poses; both gauges settled."""

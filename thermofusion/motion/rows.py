@@ -22,6 +22,7 @@ MODEL_SIGMA_M = 1e-3  # of the surface itself, where many frames are averaged
 CORRELATED = 5.0  # neighbouring points share the errors of surface and sensor: so many count as one
 CUT_SIGMAS, CUT_REACH_M = 5.0, 0.06  # of residuals that judge
 MIN_POINTS = 100  # of a frame
+FAR_SIGMAS = 3.0  # a residual beyond it is no noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,12 +147,26 @@ def gather(
     return sums, steps
 
 
+@dataclass(frozen=True, eq=False)
+class LeftOver:
+    """What frames that were not fitted to leave of the moving points, in sigmas, outliers cut at `CUT_SIGMAS`.
+
+    rms : of all; NaN where nothing is seen. of_point : (P,) rms of each point, 0 where it was not seen. times_s,
+    far_share : (n,) of the frames: when, and which share of the points seen is farther off than noise explains.
+    """
+
+    rms: float
+    of_point: Float
+    times_s: Float
+    far_share: Float
+
+
 def left_over(
     frames: CoarseFrames, rows: Sequence[int], points: BoundPoints, field: MotionField, noise_m_at_1m: float
-) -> float:
-    """Rms, in sigmas, of what frames `rows` leave of the moving points, each frame's own best rigid correction taken
-    out and outliers cut at `CUT_SIGMAS`. NaN where nothing is seen."""
-    squares, count = 0.0, 0
+) -> LeftOver:
+    """What frames `rows` leave of the moving points; each frame's own best rigid correction is taken out."""
+    squares, count = np.zeros(len(points)), np.zeros(len(points))
+    times, far = [], []
     for i in rows:
         pose = affine(field.node_m, field.at(float(frames.times_s[i])), points.binding)
         sight = look(frames, i, points, pose, CUT_REACH_M, noise_m_at_1m)
@@ -162,9 +177,13 @@ def left_over(
         w = 1 / ((1 + (t / CUT_SIGMAS) ** 2) * sigma**2)
         twist = _step(sight, w, sight.residual_m.astype(np.float64))
         moved = np.cross(twist[:3], sight.at_m) + twist[3:]  # the measurements move with the camera
-        t = (sight.residual_m + np.einsum("pi,pi->p", sight.normal, moved)) / sigma
-        squares, count = squares + float((np.minimum(np.abs(t), CUT_SIGMAS) ** 2).sum()), count + len(t)
-    return float(np.sqrt(squares / count)) if count else float("nan")
+        t = np.abs(sight.residual_m + np.einsum("pi,pi->p", sight.normal, moved)) / sigma
+        squares[sight.point] += np.minimum(t, CUT_SIGMAS) ** 2
+        count[sight.point] += 1
+        times.append(float(frames.times_s[i]))
+        far.append(float((t > FAR_SIGMAS).mean()))
+    rms = float(np.sqrt(squares.sum() / count.sum())) if count.any() else float("nan")
+    return LeftOver(rms, np.sqrt(squares / np.maximum(count, 1)), np.array(times), np.array(far))
 
 
 def _step(sight: Sight, w: Float, r: Float) -> Float:

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from ..types import Float, Float32, SurfaceMesh, Trajectory
+from ..types import Bool, Float, Float32, SurfaceMesh, Trajectory
 from .body import BodyMotion, PartMotion
+from .estimate import Solution
 from .field import MotionField, displacement
 from .graph import Binding
 from .parts import name_parts
 
-ROWS_AT_ONCE = 4  # knots whose displacements are held
+UNSETTLED_SIGMAS = 2.0  # rms of a point in frames left out: 0.6 where motion is followed
+FAR_SHARE = 0.10  # of what a frame sees: if so much is farther off than noise, the motion was not followed
+LEAST_BAD = 3  # such frames of those left out, in a row
 
 
 def amplitudes(mesh: SurfaceMesh, field: MotionField, binding: Binding) -> Float32:
@@ -42,22 +46,30 @@ def part_motions(mesh: SurfaceMesh, field: MotionField, binding: Binding, up: Fl
     )
 
 
-def described(
-    mesh: SurfaceMesh,
-    field: MotionField,
-    binding: Binding,
-    trajectory: Trajectory,
-    up: Float,
-    left_out: tuple[float, float],
-) -> BodyMotion:
-    """Everything that is stored and told of a motion of `mesh`, at rest. left_out : before and after."""
-    moved = 1e3 * amplitudes(mesh, field, binding)
+def described(mesh: SurfaceMesh, solution: Solution, binding: Binding, trajectory: Trajectory, up: Float) -> BodyMotion:
+    """Everything that is stored and told of a motion. mesh, binding : at rest. up : (3,) unit."""
+    field, left = solution.field, solution.after
+    nearest = cKDTree(solution.point_m).query(mesh.vertices_m)[1]
     return BodyMotion(
         field=field,
         binding=binding,
         trajectory=trajectory,
-        moved_mm=moved.astype(np.float32),
+        moved_mm=(1e3 * amplitudes(mesh, field, binding)).astype(np.float32),
+        unsettled=left.of_point[nearest] > UNSETTLED_SIGMAS,
         parts=part_motions(mesh, field, binding, up),
-        left_out_before=left_out[0],
-        left_out_after=left_out[1],
+        left_out_before=solution.before,
+        left_out_after=left.rms,
+        too_much=ranges(left.times_s, left.far_share > FAR_SHARE),
     )
+
+
+def ranges(times_s: Float, bad: Bool) -> tuple[tuple[float, float], ...]:
+    """(start, stop) s of stretches in which most moments are bad: at least `LEAST_BAD` of them, gaps of one bridged."""
+    out: list[tuple[float, float]] = []
+    bridged = bad.copy()
+    bridged[1:-1] |= bad[:-2] & bad[2:]
+    edge = np.flatnonzero(np.diff(np.concatenate([[0], bridged.astype(np.int8), [0]])))
+    for start, stop in edge.reshape(-1, 2):
+        if stop - start >= LEAST_BAD:
+            out.append((float(times_s[start]), float(times_s[stop - 1])))
+    return tuple(out)

@@ -27,6 +27,7 @@ Count = Annotated[int, Field(ge=0)]
 Point = tuple[float, float, float]
 
 DepthPreset = Literal["kinect-v1", "kinect-v2", "azure-kinect", "realsense-d435"]
+StandingPreset = Literal["still", "quiet", "tired", "restless", "child", "breath-held"]
 ThermalPreset = Literal["lwir-640", "lwir-320", "lepton-3.5", "p3"]
 
 
@@ -225,6 +226,14 @@ class MotionConfig(_Strict):
     breaths_per_min: Positive = 14.0
     sway_mm: NotNegative = 0.0  # of the whole body, rms
     sway_deg: NotNegative = 0.0
+    standing: StandingPreset = "still"  # bodies only: sway about the ankles, breath of chest and belly, arms, head
+    standing_amount: NotNegative = 1.0  # times what the preset moves
+    step_mm: NotNegative = 0.0  # bodies only: the left foot is set aside by so much in the middle of the recording
+
+    @property
+    def alive(self) -> bool:
+        """The body changes its shape by more than breathing_mm."""
+        return self.standing != "still" or self.step_mm > 0
 
 
 @dataclass(frozen=True)

@@ -208,7 +208,7 @@ def _chest(v: Float, config: ShapeConfig) -> Float:
 
 def _posed(v: Float, f: NDArray, config: ShapeConfig) -> Float:
     """Linear blend skinning of arms, elbows and legs about their joints; weights are harmonic on the surface."""
-    laplacian = _graph_laplacian(len(v), f)
+    laplacian = graph_laplacian(len(v), f)
     out = v.copy()
     for side in (1.0, -1.0):
         mirror = np.array([side, 1, 1])
@@ -221,18 +221,18 @@ def _posed(v: Float, f: NDArray, config: ShapeConfig) -> Float:
         lift = Rotation.from_euler("y", -config.arms_deg, degrees=True)
         forward = Rotation.from_euler("x", config.arms_forward_deg, degrees=True)
         if config.elbows_deg:
-            weight = _limb_weight(laplacian, p, ELBOW, WRIST - ELBOW, (-0.03, 0.04), 0.12)
+            weight = limb_weight(laplacian, p, ELBOW, WRIST - ELBOW, (-0.03, 0.04), 0.12)
             axis = np.cross(ELBOW - SHOULDER, WRIST - ELBOW)
             bend = Rotation.from_rotvec(np.radians(config.elbows_deg) * axis / np.linalg.norm(axis))
             moved = _turn(moved, weight, ELBOW, bend)
         if config.arms_deg or config.arms_forward_deg:
-            weight = _limb_weight(laplacian, p, SHOULDER, ELBOW - SHOULDER, (-0.04, 0.10), 0.11)
+            weight = limb_weight(laplacian, p, SHOULDER, ELBOW - SHOULDER, (-0.04, 0.10), 0.11)
             moved = _turn(moved, weight, SHOULDER, forward * lift)
         out = moved * mirror
     return out
 
 
-def _limb_weight(
+def limb_weight(
     laplacian: sparse.csr_matrix, p: Float, joint: Float, axis: Float, band_m: tuple[float, float], girth_m: float
 ) -> Float:
     """1 on the limb beyond a joint, 0 before it, harmonic between (along `axis`, over the band)."""
@@ -255,7 +255,8 @@ def _harmonic(laplacian: sparse.csr_matrix, one: NDArray, zero: NDArray) -> Floa
     return weight
 
 
-def _graph_laplacian(n: int, f: NDArray) -> sparse.csr_matrix:
+def graph_laplacian(n: int, f: NDArray) -> sparse.csr_matrix:
+    """(n, n) of the mesh's edges, dimensionless: degree minus adjacency. f : (F, 3) triangles."""
     i, j = f[:, [0, 1, 2]].ravel(), f[:, [1, 2, 0]].ravel()
     adjacency = sparse.coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n))
     adjacency = ((adjacency + adjacency.T) > 0).astype(np.float64).tocsr()

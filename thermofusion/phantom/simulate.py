@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import RecipeError
 from ..geometry.rigid import invert
-from ..types import Bool, Camera, Float
+from ..types import Bool, Camera, Float, Float32
 from .depth_cameras import DepthCamera, depth_camera, measure_depth, scaled_camera
+from .posture import Posture
 from .render import Caster, Exchange, Subject, Texture, exchange, image_rays, render_color, render_depth, render_thermal
 from .scene import SceneConfig
 from .shapes import Mesh, build_shape, vertex_normals
@@ -35,9 +37,8 @@ BREATH_LEVELS = 12  # the breathing surface is cast in so many steps: 0.4 mm apa
 COLOR_DISTORTION = (0.045, -0.11, 0.0007, -0.0009, 0.03)  # k1 k2 p1 p2 k3
 
 # one random stream for each purpose: adding a colour camera must not change the thermal noise
-SEED_SKIN, SEED_EXCHANGE, SEED_MOTION, SEED_RIG, SEED_DRIFT, SEED_DEPTH, SEED_THERMAL, SEED_TEXTURE, SEED_APART = range(
-    9
-)
+SEED_SKIN, SEED_EXCHANGE, SEED_MOTION, SEED_RIG, SEED_DRIFT = range(5)
+SEED_DEPTH, SEED_THERMAL, SEED_TEXTURE, SEED_APART, SEED_POSTURE = range(5, 10)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +61,7 @@ class Phantom:
     offsets_K: Float
     shutter: Bool
     apart: ApartMotion | None = None  # of a thermal camera that is not on the rig
+    posture: Posture | None = None  # of a body that lives
 
     def rng(self, *stream: int) -> np.random.Generator:
         """The random numbers of one purpose (and frame)."""
@@ -108,7 +110,17 @@ def build_phantom(scene: SceneConfig, seed: int = 0) -> Phantom:
         offsets,
         shutter,
         apart,
+        _posture(scene, mesh, depth_times, stream(SEED_POSTURE)),
     )
+
+
+def _posture(scene: SceneConfig, mesh: Mesh, times_s: Float, rng: np.random.Generator) -> Posture | None:
+    """How the body moves, if it does. Raises RecipeError for a subject that has no limbs."""
+    if not scene.motion.alive:
+        return None
+    if scene.shape.kind != "body":
+        raise RecipeError(f"motion.standing and motion.step_mm need shape.kind = body, not {scene.shape.kind}")
+    return Posture.of(mesh, scene.shape, scene.motion, times_s, rng)
 
 
 def simulate(
@@ -168,6 +180,8 @@ class Studio:
 
     def subject(self, time_s: float) -> Subject:
         """The subject at the nearest level of its breath."""
+        if self.phantom.posture is not None:
+            return _moved(self.subjects[0], self.phantom.posture.at(time_s))
         motion, n = self.phantom.motion, len(self.subjects)
         if n == 1:
             return self.subjects[0]
@@ -217,6 +231,14 @@ class Studio:
         assert self.color_rays is not None
         T_body, T_world = self.poses(t, color_rig())
         return render_color(self.subject(t), p.color, self.color_rays, p.scene.room, T_body, T_world, self.texture)
+
+
+def _moved(subject: Subject, vertices_m: Float32) -> Subject:
+    """The subject with its vertices (V, 3) elsewhere; what it radiates is as at rest."""
+    mesh = subject.mesh
+    normals = vertex_normals(vertices_m, mesh.triangles).astype(np.float32)
+    moved = replace(mesh, vertices_m=vertices_m, normals=normals)
+    return replace(subject, mesh=moved, caster=Caster(vertices_m, mesh.triangles))
 
 
 def _breathing_subjects(phantom: Phantom) -> tuple[Subject, ...]:
@@ -349,5 +371,6 @@ def _write_truth(phantom: Phantom, folder: Path) -> None:
         clock_error_s=phantom.scene.rig.clock_error_s,
         reflected_degC=phantom.scene.room.reflected_degC,
         vignetting_K=vignetting_field(phantom.thermal)[::8, ::8].astype(np.float32),
+        **({} if phantom.posture is None else phantom.posture.truth(times)),
     )
     (folder / "scene.toml").write_text(phantom.scene.to_toml(), encoding="utf-8")

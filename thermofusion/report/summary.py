@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 PAGE = "report.html"  # in a result's folder
 PERCENTILES = (1, 5, 50, 95, 99)
+MOST_RANGES = 4  # stretches of too much motion that are named
 MOST_MOVED = 3  # parts that the summary names
 WORST = 3  # diagnoses that the summary prints
 FAULT_OVER_SIGMA = 3.0  # of the gate's median sigma: a fault beyond it makes the result doubtful
@@ -201,6 +202,7 @@ def _motion(m: BodyMotion | None) -> dict[str, Any]:
         "parts": [vars(p) for p in m.parts],
         "median_mm": float(np.median(m.moved_mm)),
         "p95_mm": float(np.percentile(m.moved_mm, 95)),
+        "unsettled_fraction": float(m.unsettled.mean()),
         "left_out_before": m.left_out_before,
         "left_out_after": m.left_out_after,
         "nodes": len(m.field.node_m),
@@ -304,6 +306,15 @@ def _too_large(recipe: Recipe, diagnosis: Sequence[Diagnosis]) -> list[str]:
     return [f"{d.what}: {d.size_K:.2f} K, more than {limit:.2f} K" for d in diagnosis if (d.size_K or 0.0) > limit]
 
 
+def _moved_too_much(ranges: Sequence[tuple[float, float]]) -> list[str]:
+    """One sentence for all stretches in which the subject's motion could not be followed."""
+    if not ranges:
+        return []
+    when = ", ".join(f"between {start:.0f} s and {stop:.0f} s" for start, stop in ranges[:MOST_RANGES])
+    more = f" and {len(ranges) - MOST_RANGES} times more" if len(ranges) > MOST_RANGES else ""
+    return [f"the subject moved too much {when}{more}: what it looked like at rest is not known well"]
+
+
 def _quality(recipe: Recipe, scan: Scan, steps: Steps) -> dict[str, Any]:
     """The recipe's gate: each figure, its bound, and what failed."""
     gate, asked_mm, failed = recipe.quality, recipe.surface.voxel_mm, []
@@ -315,6 +326,8 @@ def _quality(recipe: Recipe, scan: Scan, steps: Steps) -> dict[str, Any]:
     if tracked < gate.min_tracked_fraction:
         failed.append(f"{tracked:.0%} of the depth frames are tracked, the recipe asks {gate.min_tracked_fraction:.0%}")
     figures: dict[str, Any] = {"tracked_fraction": tracked}
+    if steps.surface is not None and steps.surface.motion is not None:
+        failed += _moved_too_much(steps.surface.motion.too_much)
     if temperature is not None and scan.thermal is not None:
         mesh = temperature.mesh
         coverage = float(mesh.measured.mean())

@@ -75,7 +75,8 @@ def stored() -> MappingProxyType[str, type]:
             "free-views/1": FreeViews,
             "image-field/1": ImageField,
             "lost-range/1": LostRange,
-            "mapped/2": Mapped,
+            "mapped/3": Mapped,
+            "mapped/2": Mapped,  # without `unsettled`
             "mapped/1": Mapped,  # without `background`
             "motion/1": MotionResult,
             "observations/1": Observations,

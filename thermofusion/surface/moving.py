@@ -38,7 +38,7 @@ class Moved:
         s = self.solution
         binding = bind(mesh.vertices_m, mesh.triangles, s.field.node_m)
         trajectory = Trajectory(times_s[self.poses.frame], self.poses.T_world_depth)
-        return described(mesh, s.field, binding, trajectory, up, (s.before, s.after))
+        return described(mesh, s, binding, trajectory, up)
 
 
 class FramesAtRest:

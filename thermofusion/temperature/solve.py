@@ -109,7 +109,7 @@ def solve(
     progress("temperature", 4, 4)
     body_fraction = None if problem.around is None else problem.around.body_fraction
     return Temperature(
-        mesh=_mesh(mesh, result, calibration, body_fraction, problem.room, other),
+        mesh=_flagged(_mesh(mesh, result, calibration, body_fraction, problem.room, other), mapped.unsettled),
         absolute_degC=_degC(result.absolute_K),
         normal_equivalent_degC=_degC(result.normal_equivalent_K),
         apparent_degC=_degC(result.apparent_K),
@@ -208,6 +208,13 @@ def _mesh(
         metadata={"uncertainty": UNCERTAINTY_MEANS, "room": room.text(), **level},
         residual=result.residual,
     )
+
+
+def _flagged(mesh: ThermalMesh, unsettled: Bool) -> ThermalMesh:
+    """With MOVED where the subject's motion was not followed; unsettled : (V,), or (0,) for one that stood still."""
+    if not unsettled.any():
+        return mesh
+    return replace(mesh, flags=mesh.flags | np.where(unsettled, VertexFlag.MOVED, 0).astype(np.uint8))
 
 
 def _crosscal_report(c: Calibration, mapped: Mapped, problem: ThermalProblem, result: BlendResult) -> dict[str, Any]:
