@@ -7,13 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 
 from thermofusion.errors import ScanError
+from thermofusion.geometry.outline import ProjectedContour
 from thermofusion.geometry.rays import RayScene
 from thermofusion.geometry.rigid import invert, rotation_angle_deg, se3_log
 from thermofusion.phantom import scene_from_mapping, simulate
+from thermofusion.phantom.physics import fresnel_emissivity
 from thermofusion.pipeline import fuse
 from thermofusion.recipe import load_recipe
+from thermofusion.rig.edges import find_edges, smooth_image
+from thermofusion.rig.free.limb import limb_shift_px
 from thermofusion.scans import open_scan
 from thermofusion.scans.check import check_scan
 from thermofusion.scans.native.write import write_scan
@@ -113,3 +118,34 @@ def test_where_no_view_shows_the_subject_one_sentence_says_so(recorded):
     other = replace(scan, thermal=replace(stream, load=lambda i: np.roll(blobs, 40 * i, 1).astype(np.uint16)))
     with pytest.raises(ScanError, match="can be placed"):
         fuse(other, recipe)
+
+
+@pytest.mark.parametrize("radius_px", [6.0, 25.0, 100.0])
+def test_an_edge_lies_inside_a_round_body_as_far_as_the_limb_model_says(radius_px):
+    u = np.arange(-20, 20, 0.05)  # a cylinder of skin whose outline stands at u = 0, drawn by the phantom's optics
+    cos = np.sqrt(np.clip(1 - np.clip(1 + u / radius_px, -1, 1) ** 2, 0, 1))
+    bright = np.where((u < 0) & (u > -2 * radius_px), fresnel_emissivity(cos, 1.33), 0.0)
+    fine = gaussian_filter1d(bright, 0.7 / 0.05)
+    normal, still, found = np.tile([1.0, 0.0], (9, 1)), np.zeros((9, 3)), []
+    for phase in np.arange(0, 1, 0.1):  # where between two pixels the outline falls
+        row = np.array([fine[np.abs(u - c + phase) <= 0.5].mean() for c in range(-18, 19)])
+        image = smooth_image(np.tile(row, (40, 1)).astype(np.float32))
+        points = np.column_stack([np.full(9, 18.0 + phase), np.arange(16.0, 25.0)])
+        found.append(np.median(find_edges(image, ProjectedContour(points, normal, still, still), 3.0, 1.0).offset_px))
+    inside = np.sqrt(1 - (1 - 4 / radius_px) ** 2)
+    assert np.mean(found) == pytest.approx(limb_shift_px(np.full(9, inside), 4.0)[0], abs=0.06)
+
+
+def test_a_round_subject_is_refused_for_it_looks_alike_from_every_side(tmp_path):
+    walk = {"height_from_m": 0.35, "height_to_m": 0.35, "look_from_m": 0.25, "look_to_m": 0.25}
+    apart = {**SCENE["thermal"]["apart"], **walk, "frames": 5, "start_s": 0.0}
+    scene = {
+        "shape": {"kind": "cylinder", "diameter_m": 0.3, "edge_mm": 12.0},
+        "skin": {"mean_degC": 35.0, "smooth_K": 0.8},
+        "walk": {**walk, "radius_m": 1.1, "depth_frames": 40},
+        "depth": {"scale": 0.5, "noise": False},
+        "thermal": {"scale": 0.5, "netd_K": 0.04, "apart": apart},
+    }
+    scan = open_scan(simulate(scene_from_mapping(scene), tmp_path / "scan", seed=1))
+    with pytest.raises(ScanError, match="from several sides"):
+        fuse(scan, load_recipe("phantom-cylinder"))

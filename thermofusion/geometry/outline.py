@@ -49,6 +49,7 @@ class OutlineCaster:
             np.arange(self._step / 2, camera.width_px, self._step),
             np.arange(self._step / 2, camera.height_px, self._step),
         )
+        self._camera = camera
         self._rays = pixel_rays(camera, u, v).astype(np.float32)
 
     def posed(self, mesh: SurfaceMesh) -> OutlineCaster:
@@ -77,6 +78,19 @@ class OutlineCaster:
             is_body = np.isfinite(self._scene.hits(rays_from(eye, middle)).distance)[:, None]
             inner, outer = np.where(is_body, middle, inner), np.where(is_body, outer, middle)
         return self._edge_on(eye, inner)
+
+    def cosine(self, T_world_thermal: Float, uv_px: Float) -> Float:
+        """Cosine of the viewing angle where pixels' rays meet the mesh, (N,), by its smooth normals; NaN = nowhere.
+
+        T_world_thermal : (4, 4). uv_px : (N, 2).
+        """
+        rays = pixel_rays(self._camera, uv_px[:, 0], uv_px[:, 1]) @ T_world_thermal[:3, :3].T
+        known = np.asarray(np.isfinite(rays).all(axis=1))
+        found = self._scene.hits(rays_from(T_world_thermal[:3, 3], np.where(known[:, None], rays, [0.0, 0.0, 1.0])))
+        hit = known & np.isfinite(found.distance)
+        normal = np.einsum("nc,ncx->nx", found.weights, self._mesh.normals[self._mesh.triangles[found.triangle]])
+        cos = -(normal * rays).sum(axis=1) / np.maximum(np.linalg.norm(normal, axis=1), 1e-9)
+        return np.where(hit, np.clip(cos, 0, 1), np.nan)
 
     def _edge_on(self, eye: Float32, directions: Float32) -> Contour:
         """The points hit, where the surface shows its outside, and nearly edge-on."""

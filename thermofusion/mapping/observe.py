@@ -154,6 +154,7 @@ def observe(
     stream, motion = scan.thermal, None
     if rig.free is not None:
         views, left_out = rig.free.views(stream), rig.free.left_out
+        body = None  # their clock is another: the subject is seen at rest
     else:
         views, left_out = thermal_views(scan, trajectory, input.max_pose_gap_ms / 1e3, rig.camera, rig.frame_dt_s)
     if mapping.view_motion and rig.free is None:  # free views follow the outline one by one already

@@ -20,10 +20,11 @@ from ..outlines import measure_outline, reach_px, weights_about_median
 from .outline import OutlineFitter
 from .pattern import COMMON_COLUMNS, OFFSET, POSE, VIEW_COLUMNS, PatternRows, PatternSampler, pattern_normal
 
-REACH_DEG = (0.8, 0.6) + (0.5,) * 5
-BLUR_SHARE = (0.008, 0.004) + (0.002,) * 5  # of the image's width: pattern is compared blurred, then sharp
+REACH_DEG = (0.8, 0.6) + (0.5,) * 8
+BLUR_SHARE = (0.008, 0.004) + (0.002,) * 8  # of the image's width: pattern is compared blurred, then sharp
 STEP_ROTATION_DEG = 1.5  # prior of one step, one sigma
 STEP_TRANSLATION_M = 0.03
+PRIOR_SHARE = 0.01  # of these priors' weight that is left in the covariance: what nothing tells must show
 PRIOR_WIDTH_PX = 2.0
 PRIOR_COMMON = 0.5  # of field and shape, as a share of the contrast between skin and room
 SHARP_FROM = 2  # iterations with blur before
@@ -78,10 +79,9 @@ def solve_jointly(
         H, b, outline_px = _outline_normal(seen, width, columns)
         H[:-1, :-1] += normal.matrix / normal.effect
         b[:-1] += normal.right / normal.effect
-        H += np.diag(_prior(n, fitter.images.contrast.step))
         b[-1] -= width / PRIOR_WIDTH_PX**2
         ranges = np.array([s.range_m for s in seen])
-        step, cov = _solved(H, b, n)
+        step, cov = _solved(H, b, _prior(n, fitter.images.contrast.step), n)
         T = np.stack([P @ invert(se3_exp(step[k * VIEW_COLUMNS :][POSE])) for k, P in enumerate(T)])
         width += float(step[-1])
         rest = float(np.sqrt(np.mean([_rest(step[k * VIEW_COLUMNS :][POSE], c) ** 2 for k, c in enumerate(cov)])))
@@ -114,7 +114,8 @@ def _outline_rows(fitter: OutlineFitter, row: int, T_world_thermal: Float, reach
     reach = reach_px(fitter.lens, reach_deg)
     m = measure_outline(fitter.lens, view, invert(T_world_thermal), reach, fitter.images.contrast)
     block = np.floor(view.contour.point_m[m.point] / BLOCK_M).astype(np.int64)
-    return _OutlineRows(m.residual_px, m.motion, block, view.range_m)
+    limb = fitter.limb_px(view, T_world_thermal)[m.point]
+    return _OutlineRows(m.residual_px - limb, m.motion, block, view.range_m)
 
 
 def _outline_normal(seen: Sequence[_OutlineRows], width_px: float, columns: int) -> tuple[Float, Float, float]:
@@ -137,9 +138,12 @@ def _outline_normal(seen: Sequence[_OutlineRows], width_px: float, columns: int)
 
 
 def _systematic(fitter: OutlineFitter, seen: Sequence[_OutlineRows]) -> Float:
-    """(N, 6, 6): what `SYSTEMATIC_PX` does to a pose: sideways, and twice along the axis, where size alone tells."""
-    angle = SYSTEMATIC_PX / fitter.lens.focal_px
-    return np.stack([np.diag([angle**2] * 3 + [(k * angle * s.range_m) ** 2 for k in (1, 1, 2)]) for s in seen])
+    """(N, 6, 6): what `SYSTEMATIC_PX` does to a pose: sideways, and along the axis, where the outline's size tells."""
+    angle, out = SYSTEMATIC_PX / fitter.lens.focal_px, []
+    for s in seen:
+        px_per_m = np.sqrt(np.mean(s.motion[:, 5] ** 2)) if len(s.motion) else fitter.lens.focal_px / s.range_m
+        out.append(np.diag([angle**2] * 3 + [(angle * s.range_m) ** 2] * 2 + [(SYSTEMATIC_PX / px_per_m) ** 2]))
+    return np.stack(out)
 
 
 def _prior(n: int, contrast: float) -> Float:
@@ -148,12 +152,15 @@ def _prior(n: int, contrast: float) -> Float:
     return np.array(view * n + [(PRIOR_COMMON * contrast) ** -2.0] * COMMON_COLUMNS + [PRIOR_WIDTH_PX**-2.0])
 
 
-def _solved(H: Float, b: Float, n: int) -> tuple[Float, Float]:
-    """The step (P,) and every view's covariance (N, 6, 6)."""
-    size = np.sqrt(np.diag(H))
-    inverse = np.linalg.inv(H / np.outer(size, size)) / np.outer(size, size)
+def _solved(H: Float, b: Float, prior: Float, n: int) -> tuple[Float, Float]:
+    """The step (P,) and every view's covariance (N, 6, 6). prior : (P,) diagonal that keeps the step small."""
+    is_pose = np.zeros(len(b), bool)
+    is_pose[: n * VIEW_COLUMNS] = np.tile(np.arange(VIEW_COLUMNS) < OFFSET, n)
+    loose = H + np.diag(np.where(is_pose, PRIOR_SHARE, 1.0) * prior)
+    size = np.sqrt(np.diag(loose))
+    inverse = np.linalg.inv(loose / np.outer(size, size)) / np.outer(size, size)
     at = [slice(k * VIEW_COLUMNS, k * VIEW_COLUMNS + OFFSET) for k in range(n)]
-    return inverse @ b, np.stack([inverse[a, a] for a in at])
+    return np.asarray(np.linalg.solve(H + np.diag(prior), b)), np.stack([inverse[a, a] for a in at])
 
 
 def _rest(step: Float, covariance: Float) -> float:

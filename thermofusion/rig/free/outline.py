@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from ...geometry.outline import Contour, OutlineCaster, project_contour
 from ...geometry.rigid import invert, rotation_angle_deg, se3_exp
@@ -26,13 +27,18 @@ from ..outlines import (
     reach_px,
     weights_about_median,
 )
+from .limb import limb_shift_px
 
 ROUGH_STEPS = 64  # rays across the image while a pose is rough
 ROUGH_DEG = (6.0, 5.0, 4.0, 3.0, 2.0, 1.6)  # how far from the prediction an edge is looked for, by iteration
 FINE_DEG = (1.6, 1.2, 0.8, 0.6, 0.5, 0.5)
+INSIDE_PX = (3.0, 5.0, 8.0)  # of the outline, where its bend is read from the normals,
+ALIKE_M = 0.03  # and neighbouring outline this near bends alike
 STEP_ROTATION_DEG = 8.0  # prior of one step, one sigma: what the outline does not say stays
 STEP_TRANSLATION_M = 0.15
-FAULT_DEG = 0.6  # an outline point this far off counts as not explained
+FAULT_DEG = 0.6  # an outline point this far off counts as not explained,
+FAULT_SHARE = 0.02  # or off by this share of the subject's extent in the image,
+MIN_FAULT_PX = 1.5  # but no less
 MAX_COST = 0.3  # share of unexplained outline above which a view is not placed
 JUMP_COST = 0.25  # of a jump between neighbouring views
 JUMP = 0.8  # rad, and distances in ranges: a change of place this large, or larger, is a jump
@@ -81,6 +87,17 @@ class OutlineFitter:
         """The view with the outline as seen from T_world_thermal (4, 4); None where too little of it is there."""
         return self._view(row, T_world_thermal, self._fine)
 
+    def limb_px(self, view: OutlineView, T_world_thermal: Float) -> Float:
+        """Where each point of a view's outline shows against where it is, (N,) px, seen from T_world_thermal (4, 4)."""
+        seen = project_contour(self.lens, invert(T_world_thermal), view.contour)
+        shifts = [
+            limb_shift_px(self._fine.cosine(T_world_thermal, seen.uv_px - inside * seen.normal_px), inside)
+            for inside in INSIDE_PX
+        ]
+        near = cKDTree(view.contour.point_m).query_ball_point(view.contour.point_m, ALIKE_M)
+        shift = np.median(shifts, axis=0)
+        return np.array([np.median(shift[n]) for n in near])
+
     def _view(self, row: int, T: Float, caster: OutlineCaster) -> OutlineView | None:
         contour = caster.contour(T)
         if len(contour) < MIN_POINTS_OF_VIEW:
@@ -108,14 +125,16 @@ class OutlineFitter:
         view = self._view(row, T, caster or self._fine)
         if view is None:
             return 1.0
-        fault = reach_px(self.lens, FAULT_DEG)
-        m = measure_outline(self.lens, view, invert(T), 2 * fault, self.images.contrast)
         uv = project_contour(self.lens, invert(T), view.contour).uv_px
         with np.errstate(invalid="ignore"):
             inside = ((uv > 4) & (uv < [self.lens.width_px - 5, self.lens.height_px - 5])).all(axis=1)
         n = int(inside.sum())
         if n < MIN_POINTS_OF_VIEW:
             return 1.0
+        extent = 2 * float(np.sqrt(uv[inside].var(axis=0).sum()))
+        fault = min(reach_px(self.lens, FAULT_DEG), max(MIN_FAULT_PX, FAULT_SHARE * extent))
+        reach = 2 * reach_px(self.lens, FAULT_DEG)
+        m = measure_outline(self.lens, view, invert(T), reach, self.images.contrast)
         off = np.ones(len(uv))
         off[m.point] = np.clip((m.residual_px / fault) ** 2, 0, 1)
         return float(off[inside].mean())

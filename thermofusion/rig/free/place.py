@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import ScanError, counted
-from ...geometry.rigid import invert, se3_exp, se3_log
+from ...geometry.rigid import invert, rotation_angle_deg, se3_exp, se3_log
 from ...physics.signal import SignalConverter
 from ...progress import Progress, silent
 from ...types import Camera, Float, Float32, Int, Scan, SurfaceMesh, ThermalStream, ThermalViews, Trajectory, brief
@@ -23,13 +23,16 @@ from ..outlines import MIN_STEP_NETD, Contrast
 from .joint import Joint, solve_jointly
 from .outline import MAX_COST, Images, OutlineFitter, Placed, walk_through
 from .pattern import PatternSampler
-from .search import Candidates, search, small_pictures
+from .search import Candidates, body_picture, search
 
 MAX_VIEWS = 120  # that enter, evenly chosen: more say nothing new
 MIN_VIEWS = 4  # fewer placed are a result only where they are most of the views
 UNSURE_COST = 0.1  # a view with more of its outline unexplained is tried from its neighbours' places, too
+AMBIGUOUS = 0.01  # share of the outline by which the right side must be better than another, in half of the views
+OTHER_SIDE_DEG = 15.0
 SWEEPS = 2  # through the views, to start from neighbours
 ODD_PATTERN = 3.0  # times the usual residual of the pattern: a view that shows another side of the subject
+MAX_SIGMA_MM = 20.0  # of a view's place: one that is known less well says nothing
 SHUTTER, NOT_PLACED, NOT_NEEDED = "shutter", "not placed", "more than needed"
 
 
@@ -95,7 +98,7 @@ def place_views(
     taken = _Taken.of(scan, chosen)
     up = (trajectory.T_world_depth[:, :3, :3] @ np.array(scan.depth_up)).mean(axis=0)
     fitter = OutlineFitter(mesh, stream.camera.lens, taken.images)
-    found = search(mesh, stream.camera.lens, up, taken.small)
+    found = search(mesh, stream.camera.lens, up, taken.body)
     placed = _by_outline(fitter, found, progress)
     good = [k for k, p in enumerate(placed) if p.cost < MAX_COST]
     _enough(scan, len(good), len(chosen))
@@ -118,10 +121,10 @@ def place_views(
 
 @dataclass(frozen=True, eq=False)
 class _Taken:
-    """The images: radiance (H, W) each; small (N, h, w) and soft (H, W) each, 1 = subject; netd in radiance."""
+    """The images: radiance (H, W) each; body (N, h, w) and soft (H, W) each, 1 = subject; netd in radiance."""
 
     radiance: Sequence[Float32]
-    small: Float32
+    body: Float32
     soft: Sequence[Float32]
     images: Images
     netd: float
@@ -136,10 +139,10 @@ class _Taken:
         assert stream is not None
         converter = SignalConverter(stream.camera)
         radiance = [converter.radiance(stream.load(int(i)), stream.places[i]) for i in frames]
-        small = [small_pictures(r) for r in radiance]
+        body = [body_picture(r) for r in radiance]
         soft = [
             np.asarray(cv2.resize(s, r.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
-            for s, r in zip(small, radiance, strict=True)
+            for s, r in zip(body, radiance, strict=True)
         ]
         steps = [
             np.nanmedian(r[s > 0.9]) - np.nanmedian(r[s < 0.1])
@@ -156,7 +159,7 @@ class _Taken:
                 hint="the subject must be warmer than what is behind it; or record with a calibrated rig",
             )
         images = Images([smooth_image(r) for r in radiance], Contrast(1.0, step))
-        return cls(radiance, np.stack(small), soft, images, netd)
+        return cls(radiance, np.stack(body), soft, images, netd)
 
 
 def _by_outline(fitter: OutlineFitter, found: Candidates, progress: Progress) -> list[Placed]:
@@ -166,12 +169,27 @@ def _by_outline(fitter: OutlineFitter, found: Candidates, progress: Progress) ->
         candidates.append([fitter.rough(row, T) for T in starts])
         progress("rig", row + 1, len(found.T_world_thermal))
     placed = walk_through(candidates)
+    if np.median([_margin(p, c) for p, c in zip(placed, candidates, strict=True)]) < AMBIGUOUS:
+        raise ScanError(
+            "the thermal views could have been taken from several sides: the subject's outline fits from each",
+            hint="a round or flat subject has no outline to tell by; record with the thermal camera on the depth rig",
+        )
     for _ in range(SWEEPS):
         for row, own in enumerate(placed):
             if own.cost > UNSURE_COST:
                 tries = [fitter.rough(row, T) for T in _near(placed, row)]
                 placed[row] = min([own, *tries], key=lambda p: p.cost)
     return [fitter.fine(row, p.T_world_thermal) if p.cost < MAX_COST else p for row, p in enumerate(placed)]
+
+
+def _margin(chosen: Placed, candidates: Sequence[Placed]) -> float:
+    """How much more of the outline the best pose from another side leaves unexplained; inf where there is none."""
+    others = [
+        c.cost
+        for c in candidates
+        if rotation_angle_deg(invert(chosen.T_world_thermal) @ c.T_world_thermal) > OTHER_SIDE_DEG
+    ]
+    return min(others, default=np.inf) - chosen.cost
 
 
 def _near(placed: Sequence[Placed], row: int) -> list[Float]:
@@ -186,10 +204,11 @@ def _near(placed: Sequence[Placed], row: int) -> list[Float]:
 
 
 def _fits(joint: Joint, cost: Sequence[float]) -> NDArray[np.bool_]:
-    """Which views agree with the others: by their outline, and by the pattern."""
+    """Which views agree with the others: by outline and pattern, and which are held."""
     usual = np.nanmedian(joint.pattern) if np.isfinite(joint.pattern).any() else np.inf
     odd = np.nan_to_num(joint.pattern) > ODD_PATTERN * usual
-    return ~odd & (np.array(cost) < MAX_COST)
+    loose = 1e3 * np.sqrt(np.linalg.eigvalsh(joint.covariance[:, 3:, 3:])[:, -1]) > MAX_SIGMA_MM
+    return ~odd & ~loose & (np.array(cost) < MAX_COST)
 
 
 def _enough(scan: Scan, placed: int, tried: int) -> None:

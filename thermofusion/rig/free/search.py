@@ -21,7 +21,9 @@ from ...geometry.rays import RayScene, rays_from
 from ...geometry.rigid import invert
 from ...types import Bool, Camera, Float, Float32, SurfaceMesh
 
-WIDTH_PX = 36  # of the small pictures
+BODY_PX = 96  # width of the picture in which the body is told from the room
+WIDTH_PX = 36  # of the small pictures, which show the part of it around the subject
+MARGIN = 1.3  # of that part over the subject's extent
 AZIMUTHS = 24
 ELEVATIONS_DEG = (-25.0, -5.0, 15.0, 35.0)
 DISTANCES_M = (0.55, 0.85, 1.3, 2.0, 3.1)  # cast here; between them perspective hardly changes
@@ -29,7 +31,7 @@ SCALES = (0.87, 1.0, 1.15)  # of the distance, by resizing the picture
 ROLLS_DEG = (-12.0, 0.0, 12.0)
 QUARTERS = (0, 1, 2, 3)  # upright, or turned by so many right angles
 PROBES = 6  # views that decide how the camera was held
-CANDIDATES = 5  # kept for a view
+CANDIDATES = 8  # kept for a view
 APART_DEG = 20.0  # viewpoints nearer than this are one candidate
 BORDER_M = 0.005  # and a pixel: outline this near to an open border, and not edge-on, is where the mesh ends
 CUT_COS = 0.7
@@ -61,26 +63,27 @@ class Silhouette:
 def search(mesh: SurfaceMesh, lens: Camera, up: Float, body: NDArray) -> Candidates:
     """Candidates for N views.
 
-    up : (3,) which way is up in the mesh's world. body : (N, h, w) from `small_pictures`, 1 = subject.
+    up : (3,) which way is up in the mesh's world. body : (N, h, w) from `body_picture`, 1 = subject.
     """
-    focal = lens.focal_px * body.shape[2] / lens.width_px
-    pictures = _Pictures.of(body)
-    silhouettes = cast_silhouettes(mesh, focal, up, body.shape[1:])
+    small, off_px, enlarged = _around(body)
+    focal = lens.focal_px * body.shape[2] / lens.width_px * enlarged
+    pictures = _Pictures.of(small)
+    silhouettes = cast_silhouettes(mesh, focal, up, small.shape[1:])
     probes = np.unique(np.round(np.linspace(0, len(body) - 1, PROBES)).astype(int))
     some = pictures.rows(probes)
     heard = [np.median(_scan(some, silhouettes, ((90.0 * q, 1.0),))[0].max(axis=1)) for q in QUARTERS]
     quarter = QUARTERS[int(np.argmax(heard))]
     ways = tuple((roll + 90.0 * quarter, scale) for roll in ROLLS_DEG for scale in SCALES)
-    return _best(silhouettes, ways, focal, pictures.shape, *_scan(pictures, silhouettes, ways))
+    return _best(silhouettes, ways, focal, off_px, *_scan(pictures, silhouettes, ways))
 
 
-def small_pictures(radiance: NDArray) -> Float32:
-    """The warm body in an image (H, W) as a small picture (h, w): 0 room to 1 body, by Otsu's threshold."""
+def body_picture(radiance: NDArray) -> Float32:
+    """The warm body in an image (H, W) as a smaller picture (h, w), share 0 room to 1 body, by Otsu's threshold."""
     h, w = radiance.shape
-    size = WIDTH_PX, max(2, round(h * WIDTH_PX / w))
+    size = BODY_PX, max(2, round(h * BODY_PX / w))
     filled = np.where(np.isfinite(radiance), radiance, np.nanmin(radiance)).astype(np.float32)
-    small = cv2.resize(cv2.GaussianBlur(filled, (0, 0), 0.3 * w / WIDTH_PX), size, interpolation=cv2.INTER_AREA)
-    low, high = np.percentile(small, [2, 98])
+    small = cv2.resize(cv2.GaussianBlur(filled, (0, 0), 0.3 * w / BODY_PX), size, interpolation=cv2.INTER_AREA)
+    low, high = np.percentile(small, [1, 99.7])
     level = np.clip((small - low) / max(float(high - low), 1e-9), 0, 1)
     threshold, _ = cv2.threshold((255 * level).astype(np.uint8), 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
     room, skin = level[level <= threshold / 255], level[level > threshold / 255]
@@ -88,6 +91,26 @@ def small_pictures(radiance: NDArray) -> Float32:
         return np.zeros(size[::-1], np.float32)
     a, b = float(np.median(room)), float(np.median(skin))
     return np.asarray(np.clip((level - a) / max(b - a, 1e-9) * 2 - 0.5, 0, 1), np.float32)
+
+
+def _around(body: NDArray) -> tuple[Float32, Float, float]:
+    """The subject's part of each picture, (N, h, w), their middles off the images', (N, 2) px, and the enlargement."""
+    _, h, w = body.shape
+    boxes = np.tile([0, 0, w - 1, h - 1], (len(body), 1))
+    for box, picture in zip(boxes, body, strict=True):
+        v, u = np.nonzero(picture > 0.5)
+        if len(u):
+            box[:] = u.min(), v.min(), u.max(), v.max()
+    extent = ((boxes[:, 2:] - boxes[:, :2] + 1) / [w, h]).max(axis=1)
+    share = float(np.clip(MARGIN * np.percentile(extent, 90), WIDTH_PX / w, 1))
+    size = np.array([round(share * w), round(share * h)])
+    low = np.clip(np.rint((boxes[:, :2] + boxes[:, 2:] + 1 - size) / 2), 0, np.array([w, h]) - size).astype(int)
+    small = WIDTH_PX, max(2, round(WIDTH_PX * size[1] / size[0]))
+    parts = [p[y : y + size[1], x : x + size[0]] for p, (x, y) in zip(body, low, strict=True)]
+    enlarged = WIDTH_PX / size[0]
+    off = (low + size / 2 - np.array([w, h]) / 2) * enlarged
+    shrunk = np.stack([cv2.resize(p, small, interpolation=cv2.INTER_AREA) for p in parts])
+    return np.asarray(shrunk, np.float32), off, float(enlarged)
 
 
 def cast_silhouettes(mesh: SurfaceMesh, focal_px: float, up: Float, shape: tuple[int, ...]) -> list[Silhouette]:
@@ -246,12 +269,12 @@ def _best(
     silhouettes: list[Silhouette],
     ways: tuple[tuple[float, float], ...],
     focal_px: float,
-    shape: tuple[int, int],
+    off_px: Float,
     score: Float32,
     how: NDArray[np.intp],
 ) -> Candidates:
     """The best viewpoints of each view that lie apart."""
-    h, w = shape
+    h, w = (side // 2 for side in silhouettes[0].mask.shape)
     rows, kept, left = np.arange(len(score)), [], score.copy()
     forward = np.stack([s.T_world_thermal[:3, 2] for s in silhouettes])
     for _ in range(CANDIDATES):
@@ -262,5 +285,5 @@ def _best(
     for n, k in np.ndindex(pick.shape):
         way, at = how[n, pick[n, k]]
         (roll_deg, scale), (dv, du) = ways[way], divmod(int(at), 2 * w)
-        poses[n, k] = _posed(silhouettes[pick[n, k]], scale, roll_deg, _centred(du, dv, h, w) / focal_px)
+        poses[n, k] = _posed(silhouettes[pick[n, k]], scale, roll_deg, (_centred(du, dv, h, w) + off_px[n]) / focal_px)
     return Candidates(poses, np.asarray(score[rows[:, None], pick], np.float64))
