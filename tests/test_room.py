@@ -11,11 +11,11 @@ from support.synthetic_views import BAND, HEIGHT, L_ROOM, REFLECTED_K, WIDTH, fi
 from test_surroundings import sphere_part
 
 from thermofusion.diagnosis.radiation import of_room
+from thermofusion.geometry.sphere import N_CELLS, cell_directions, cell_of, cell_solid_angles, harmonics
 from thermofusion.mapping.background import SPREADS, Background, find_background
 from thermofusion.physics.signal import SignalConverter
 from thermofusion.temperature import crosscal
-from thermofusion.temperature.room.cells import N_CELLS, cell_directions, cell_of, cell_solid_angles
-from thermofusion.temperature.room.harmonics import harmonics, open_transfer
+from thermofusion.temperature.room.harmonics import open_transfer
 from thermofusion.temperature.room.map import RoomMap, RoomPrior
 from thermofusion.temperature.room.surroundings import surroundings
 from thermofusion.temperature.room.survey import survey

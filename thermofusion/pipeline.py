@@ -34,8 +34,8 @@ STAGES = (
     Stage("tracking", ("input", "subject", "tracking")),
     Stage("surface", ("input", "subject", "surface"), edition=2),
     Stage("rig", ("input", "rig"), edition=3),
-    Stage("mapping", ("input", "mapping"), edition=5),
-    Stage("temperature", ("mapping", "temperature"), edition=5, handed_out=RESULT),
+    Stage("mapping", ("input", "mapping"), edition=8),
+    Stage("temperature", ("mapping", "temperature"), edition=6, handed_out=RESULT),
 )
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
 

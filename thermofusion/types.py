@@ -149,6 +149,31 @@ class SignalCurve:
     parameters: dict[str, tuple[float, ...]] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class LensScatter:
+    """Light that a lens spreads widely (see `physics.scatter`).
+
+    parts : (share of the light, one sigma of the Gaussian that it is spread over [image widths]) each. sigma : one
+    sigma of the whole share.
+    """
+
+    parts: tuple[tuple[float, float], ...]
+    sigma: float
+
+    @property
+    def share(self) -> float:
+        """Of all light."""
+        return sum(g for g, _ in self.parts)
+
+    @property
+    def unit(self) -> LensScatter:
+        """The same shape with all of the light spread; of one part where there is none."""
+        total = self.share
+        if total:
+            return LensScatter(tuple((g / total, w) for g, w in self.parts), 0.0)
+        return LensScatter(((1.0, self.parts[0][1]),), 0.0)
+
+
 @dataclass(frozen=True, eq=False)
 class ThermalCamera:
     """The thermal camera: its lens, its signal, where it sits on the rig and what its clock says.

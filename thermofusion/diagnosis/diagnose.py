@@ -12,7 +12,7 @@ from ..temperature.crosscal import Calibration
 from ..temperature.sensor.pattern import Pattern
 from ..temperature.solve import Temperature
 from ..types import VertexFlag
-from .radiation import of_room
+from .radiation import of_lens, of_room
 from .words import Diagnosis
 
 OUTLINE_PX = 0.4  # clean scans leave 0.15-0.3 px between the outlines of model and image
@@ -26,6 +26,7 @@ VOCABULARY = MappingProxyType(
         "fixed pattern": "let the camera make a two-point correction before a black surface, and clean its window",
         "readings agree by place in the image": "record more views in which the same skin crosses the whole image",
         "reflected temperature stated wrong": "measure it with crumpled foil where the person stood, or leave it out",
+        "lens scatters light": "clean the lens, and keep hot things out of the picture's surroundings",
         "surface that is not skin": "take off what can be taken off; its temperature is not the skin's",
         "dead pixels": "have the camera's list of bad pixels renewed",
         "depth scale is off": "measure something of known size with the depth camera, and the spacing of the cameras",
@@ -45,6 +46,7 @@ def diagnose(mapped: Mapped, temperature: Temperature, image_px: tuple[int, int]
         found += _references(calibration)
     found += _skin(temperature)
     found += of_room(temperature.room)
+    found += of_lens(mapped.scatter)
     found += _outlines(mapped)
     if len(mapped.bad_pixels):
         share = len(mapped.bad_pixels) / (image_px[0] * image_px[1])

@@ -1,9 +1,23 @@
-"""What the room's light says against what was stated of it."""
+"""Light that the model used to leave out: the room's own, and what the lens spreads."""
 
 from __future__ import annotations
 
 from ..temperature.room.map import RoomMap
+from ..types import LensScatter
 from .words import Diagnosis
+
+
+def of_lens(scatter: LensScatter | None) -> list[Diagnosis]:
+    """Light that the lens spreads, where it was found in the scan."""
+    if scatter is None or not scatter.share:
+        return []
+    percent = 100 * scatter.share
+    width = sum(g * w for g, w in scatter.parts) / scatter.share
+    text = (
+        f"a halo of {percent:.1f} % of the light, spread over {width:.0%} of the image's width, goes with the subject"
+    )
+    done = "taken off every picture; its uncertainty is in sigma"
+    return [Diagnosis("lens scatters light", text, None, "whole image", done, size=percent, unit="%")]
 
 
 def of_room(room: RoomMap | None) -> list[Diagnosis]:

@@ -225,9 +225,9 @@ def _with_motion(
     if not motion.kept:
         return report
     views = replace(mapped.views, T_world_thermal=motion.T_world_thermal)
-    rows = observe_views(
-        scan.thermal, SurfaceRays(surface, result.surface.motion), views, SignalConverter(camera), recipe.mapping
-    )
+    converter = SignalConverter(camera, scatter=mapped.scatter)
+    rays = SurfaceRays(surface, result.surface.motion)
+    rows = observe_views(scan.thermal, rays, views, converter, recipe.mapping)
     moved = replace(mapped, views=views, observations=rows)
     bench = Bench.of(scan, result.surface, moved, result.temperature, recipe)
     left = bench.sample(report.vertices).predictions(folds, progress)

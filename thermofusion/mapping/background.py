@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..geometry.camera import pixel_rays
 from ..geometry.rays import RayScene, rays_from
+from ..physics.scatter import blurred
 from ..physics.signal import SignalConverter
 from ..types import (
     BlackbodyReference,
@@ -24,6 +25,7 @@ from ..types import (
     Float,
     Float32,
     Int,
+    LensScatter,
     Reference,
     SurfaceMesh,
     ThermalStream,
@@ -37,7 +39,7 @@ CLEAR_BLOCKS = 1.5  # from the outline, beyond which a block counts: point sprea
 WARM_SHARE = 0.3  # of the way from room to skin: blocks beyond it, side by side with the subject, belong to it
 SOURCE_BLOCKS = 2  # about a blackbody that are left out
 LEAST_NOISE = 0.05  # of NETD: pixels of a block that differ by less were not read from a sensor
-SPREADS = (0.025, 0.05, 0.1, 0.2)  # one sigma of the blurs that scatter is made of, image widths
+SPREADS = (0.02, 0.035, 0.06, 0.1, 0.17)  # one sigma of the blurs that scatter is made of, image widths
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +65,12 @@ class Background:
 
     def __len__(self) -> int:
         return len(self.view)
+
+    def without(self, scatter: LensScatter) -> Background:
+        """With what the lens spread onto it taken off. scatter : of widths that `SPREADS` names."""
+        share = {w: g for g, w in scatter.parts}
+        g = np.array([share.get(w, 0.0) for w in SPREADS], np.float32)
+        return replace(self, radiance=self.radiance * (1 + g.sum()) - self.spread @ g)
 
 
 class BackgroundFinder:
@@ -141,11 +149,6 @@ class BackgroundFinder:
                 hi = np.ceil(source.polygon_px.max(0) / self.block_px).astype(int) + SOURCE_BLOCKS
                 near[max(lo[1], 0) : max(hi[1] + 1, 0), max(lo[0], 0) : max(hi[0] + 1, 0)] = True
         return near
-
-
-def blurred(image: Float32, sigma_px: float) -> Float32:
-    """An image (H, W) under a Gaussian blur; beyond its border the border goes on."""
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px, borderType=cv2.BORDER_REPLICATE), np.float32)
 
 
 def find_background(

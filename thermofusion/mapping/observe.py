@@ -31,6 +31,7 @@ from ..types import (
     Float,
     Float32,
     Int,
+    LensScatter,
     Observations,
     Scan,
     SurfaceMesh,
@@ -43,6 +44,7 @@ from .background import Background, find_background
 from .motion import MotionResult, view_corrections
 from .pixels import bad_pixels
 from .references import BlackbodyReading, read_blackbodies
+from .scatter import estimate_scatter, spread_on
 from .views import thermal_views
 
 EDGE_CAP_PX = 32.0  # distances to a silhouette are stored up to here; nothing depends on larger ones
@@ -114,7 +116,8 @@ class Mapped:
     outline_px : what the rig's alignment left between the outlines of model and image, NaN = not measured.
     jitter_s : one sigma of what single thermal frames' stamps lacked and was put right. depth_scale : depth over truth
     less 1, as outlines ask for it, 0 = no news.
-    background : what the views show of the room; None in results of earlier versions.
+    background : what the views show of the room; None in results of earlier versions. scatter : of the lens, taken off
+    where its share is not 0; spread : (V,) what one whole share of it would do to each vertex, W m-2 sr-1.
     unsettled : (V,) vertices whose motion was not followed; (0,) for a subject that stood still.
     """
 
@@ -129,8 +132,17 @@ class Mapped:
     depth_scale: float = 0.0
     background: Background | None = None
     unsettled: Bool = field(default_factory=lambda: np.zeros(0, bool))
+    scatter: LensScatter | None = None
+    spread: Float32 | None = None
 
     __repr__ = brief
+
+    @property
+    def scattered(self) -> Float32 | None:
+        """(V,) what one sigma of the lens's scatter does to readings of each vertex, W m-2 sr-1; None: not known."""
+        if self.scatter is None or self.spread is None:
+            return None
+        return np.asarray(self.spread * np.float32(self.scatter.sigma))
 
 
 def observe(
@@ -164,13 +176,17 @@ def observe(
     bad = bad_pixels(stream, views.frame, converter)
     if bad.any():
         converter = SignalConverter(stream.camera, bad)
+    background = find_background(stream, surface, views, converter, scan.references)
+    scatter = estimate_scatter(background, stream.camera.lens, converter.band)
+    if scatter.share:
+        converter, background = SignalConverter(stream.camera, bad, scatter), background.without(scatter)
     observations = observe_views(stream, SurfaceRays(surface, body), views, converter, mapping, progress=progress)
     blackbodies = read_blackbodies(stream, views, scan.references, converter)
     uv = np.argwhere(bad)[:, ::-1].astype(np.int32)
-    background = find_background(stream, surface, views, converter, scan.references)
+    spread = spread_on(stream, views, converter, observations, len(surface))
     left = rig.residual_px_after, rig.jitter_s, rig.depth_scale
     unsettled = np.zeros(0, bool) if body is None else body.unsettled
-    return Mapped(views, left_out, observations, blackbodies, motion, uv, *left, background, unsettled)
+    return Mapped(views, left_out, observations, blackbodies, motion, uv, *left, background, unsettled, scatter, spread)
 
 
 def observe_views(

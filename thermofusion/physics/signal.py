@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ScanError
-from ..types import Bool, Float, Float32, SignalCurve, ThermalCamera
+from ..types import Bool, Float, Float32, LensScatter, SignalCurve, ThermalCamera
 from .band import TABLE_K, ZERO_DEGC_K, Band
+from .scatter import without_scatter
 
 MAX_UNUSABLE = 0.01  # share of an image's pixels that may lie off the radiometric curve (dead pixels)
 
@@ -17,13 +18,16 @@ class SignalConverter:
 
     Counts go through a look-up table of all 65,536 values, made once. Values where the camera's curve leaves its
     longest strictly monotone stretch, or 150-1500 K, are off the curve: NaN (dead pixels), an error when more
-    than 1 % of an image is. bad_pixels : (H, W) mask of pixels that are NaN whatever they say.
+    than 1 % of an image is. bad_pixels : (H, W) mask of pixels that are NaN whatever they say. scatter : of the lens,
+    taken off.
 
     Raises ScanError when the curve is incomplete or usable nowhere.
     """
 
-    def __init__(self, camera: ThermalCamera, bad_pixels: Bool | None = None) -> None:
-        self.signal, self._bad = camera.signal, bad_pixels
+    def __init__(
+        self, camera: ThermalCamera, bad_pixels: Bool | None = None, scatter: LensScatter | None = None
+    ) -> None:
+        self.signal, self._bad, self.scatter = camera.signal, bad_pixels, scatter
         self.band = Band(*camera.band_um)
         self._lut: Float32 | None = None
         self.counts_range: tuple[int, int] | None = None
@@ -80,7 +84,7 @@ class SignalConverter:
             )
         if self._bad is not None:
             out[self._bad] = np.nan
-        return out
+        return out if self.scatter is None else without_scatter(out, self.scatter)
 
 
 def counts_to_kelvin(signal: SignalCurve, counts: Float) -> Float:

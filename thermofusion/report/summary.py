@@ -265,6 +265,7 @@ def _mapping(m: Mapped) -> dict[str, Any]:
         "left_out": m.left_out,
         "observations": len(m.observations),
         "blackbody_readings": len(m.blackbodies),
+        "scatter": None if m.scatter is None else {"share": m.scatter.share, "sigma": m.scatter.sigma},
     }
     if m.motion is None:
         return out

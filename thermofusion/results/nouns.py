@@ -38,6 +38,36 @@ def _shape() -> dict[str, type]:
     }
 
 
+def _of_types() -> dict[str, type]:
+    """Nouns that several rooms share."""
+    from ..types import (
+        Camera,
+        LensScatter,
+        Observations,
+        SharedErrors,
+        SignalCurve,
+        SurfaceMesh,
+        ThermalCamera,
+        ThermalMesh,
+        ThermalViews,
+        Trajectory,
+    )
+
+    return {
+        "camera/1": Camera,
+        "lens-scatter/1": LensScatter,
+        "observations/1": Observations,
+        "shared-errors/1": SharedErrors,
+        "signal-curve/1": SignalCurve,
+        "surface-mesh/1": SurfaceMesh,
+        "thermal-camera/1": ThermalCamera,
+        "thermal-mesh/2": ThermalMesh,
+        "thermal-mesh/1": ThermalMesh,  # without `residual`
+        "thermal-views/1": ThermalViews,
+        "trajectory/1": Trajectory,
+    }
+
+
 @cache
 def stored() -> MappingProxyType[str, type]:
     """Name and version -> class. A class whose fields change gets a new version; the old one stays, with its reader."""
@@ -53,48 +83,29 @@ def stored() -> MappingProxyType[str, type]:
     from ..temperature.sensor.pattern import Pattern
     from ..temperature.solve import Temperature
     from ..tracking.track import LostRange, TrackingResult
-    from ..types import (
-        Camera,
-        Observations,
-        SharedErrors,
-        SignalCurve,
-        SurfaceMesh,
-        ThermalCamera,
-        ThermalMesh,
-        ThermalViews,
-        Trajectory,
-    )
 
     return MappingProxyType(
         {
             **_shape(),
+            **_of_types(),
             "background/1": Background,
             "blackbody-reading/1": BlackbodyReading,
             "calibration/1": Calibration,
-            "camera/1": Camera,
             "free-views/1": FreeViews,
             "image-field/1": ImageField,
             "lost-range/1": LostRange,
-            "mapped/3": Mapped,
+            "mapped/4": Mapped,
+            "mapped/3": Mapped,  # without `scatter`
             "mapped/2": Mapped,  # without `unsettled`
             "mapped/1": Mapped,  # without `background`
             "motion/1": MotionResult,
-            "observations/1": Observations,
             "rig/1": RigResult,
-            "shared-errors/1": SharedErrors,
             "room-map/1": RoomMap,
             "sensor-pattern/1": Pattern,
-            "signal-curve/1": SignalCurve,
-            "surface-mesh/1": SurfaceMesh,
             "temperature/3": Temperature,
             "temperature/2": Temperature,  # without `room`
             "temperature/1": Temperature,  # without `shared`
-            "thermal-camera/1": ThermalCamera,
-            "thermal-mesh/2": ThermalMesh,
-            "thermal-mesh/1": ThermalMesh,  # without `residual`
-            "thermal-views/1": ThermalViews,
             "tracking/1": TrackingResult,
-            "trajectory/1": Trajectory,
         }
     )
 

@@ -38,7 +38,8 @@ class ThermalProblem:
     vertices are a sample. errors : one-sigma parts of an observation. blackbodies, contacts : what sets the level.
     vertices_per_patch : vertices that share a normal's error. other : (V,) what is not skin, None = not asked.
     room_map : radiance of the room from each direction; None: even, as stated. transfer : (V, 9) how its harmonics
-    light a vertex. uneven : (V,) what the room adds to what vertices reflect, beyond its mean.
+    light a vertex. uneven : (V,) what the room adds to what vertices reflect, beyond its mean. scattered : (V,) what
+    one sigma of the lens's scatter does to readings of a vertex.
     """
 
     vertices: NDArray[np.intp]
@@ -65,6 +66,7 @@ class ThermalProblem:
     room_map: RoomMap | None = None
     transfer: Float32 | None = None
     uneven: Float | None = None
+    scattered: Float32 | None = None
 
     @classmethod
     def of(
@@ -112,6 +114,7 @@ class ThermalProblem:
             vertices_per_patch=vertices_per_patch(surface, normal_window_m),
             mapping=mapping,
             settings=settings,
+            scattered=mapped.scattered,
             room_map=RoomMap.unseen(_room_prior(room, settings, band)),
             transfer=open_transfer(surface.normals).astype(np.float32) if around is None else around.transfer,
         )
@@ -220,6 +223,7 @@ class ThermalProblem:
             L_reflected=self.L_reflected[chosen],
             transfer=None if self.transfer is None else self.transfer[chosen],
             uneven=None if self.uneven is None else self.uneven[chosen],
+            scattered=None if self.scattered is None else self.scattered[chosen],
             around=None,
             errors=replace(self.errors, gradient_K_per_m=gradient[chosen]),
             contacts=tuple(c for c in contacts if len(c.vertices)),

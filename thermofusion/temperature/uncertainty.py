@@ -168,6 +168,7 @@ class Uncertainty:
         do beyond their common shift. gain : likewise. scale : of the depth, on a gradient. pattern : what
         residuals still have in common by place in the image. views : how far views disagree, for methods that do
         not calibrate them.
+        scatter : of the lens's scatter that was taken off, or could be there.
         not_skin : emissivity of what is flagged as not skin.
     level_parts_K : reference, emissivity0, reflected: one number each. A relative result has no reference: its level is
         unknown beyond these.

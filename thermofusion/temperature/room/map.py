@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...geometry.sphere import COUNT, DIPOLE, N_CELLS, ORDERS, cell_directions, cell_of, cell_solid_angles, harmonics
 from ...types import Bool, Float
-from .cells import N_CELLS, cell_directions, cell_of, cell_solid_angles
-from .harmonics import COUNT, DIPOLE, ORDERS, harmonics
 
 QUADRUPOLE_K = 0.4  # one sigma of a coefficient of order 2
 # What no view showed may differ from its continuation: one sigma, and the angle over which that is alike. Floor and

@@ -20,9 +20,9 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from ...geometry.rays import Hits, RayScene, barycentric
+from ...geometry.sphere import cell_of, harmonics
 from ...types import Bool, Float, Float32, SurfaceMesh
-from .cells import cell_of
-from .harmonics import harmonics, open_transfer
+from .harmonics import open_transfer
 
 SAMPLE_SPACING_M = 0.020  # of the vertices rays start from: F changes over centimetres
 DIRECTIONS = 96  # per sample: F to about 0.01, which is 3 mK on skin in a room 10 K colder

@@ -19,12 +19,11 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_matrix
 
+from ...geometry.sphere import COUNT, N_CELLS, cell_of, harmonics
 from ...mapping.background import Background
 from ...robust import MAD_PER_SIGMA, TUKEY, tukey_weight
 from ...types import Float
 from ..crosscal import Calibration
-from .cells import N_CELLS, cell_of
-from .harmonics import COUNT, harmonics
 from .map import RoomMap, RoomPrior, unseen_covariance
 
 LEAST_ROWS = 2000  # blocks of background, below which no room is looked at

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
+from ...geometry.sphere import DIPOLE, ORDERS
 from ...types import Float
 from ..crosscal import Overlap
-from .harmonics import DIPOLE, ORDERS
 
 SIDES = np.array(ORDERS) == 1
 WIDE_K = 10.0  # one sigma of a dipole before the skin is asked

@@ -1,12 +1,20 @@
-"""Directions in cells of some 10°: the grain in which a room is looked at."""
+"""Directions: the sphere in cells of some 10°, and spherical harmonics of order 0 to 2 on it.
+
+The harmonics are scaled so that each has a mean square of 1 over the sphere: the first is 1, and a coefficient has the
+unit of what is described. The irradiance of a convex diffuse surface lies in these nine numbers to 99 % (Ramamoorthi
+and Hanrahan, SIGGRAPH 2001).
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...types import Float, Int
+from ..types import Float, Int
 
+ORDERS = (0, 1, 1, 1, 2, 2, 2, 2, 2)
+COUNT = len(ORDERS)
+DIPOLE = 3**-0.5  # coefficient of order 1 of a room that is 1 warmer on one side, 1 colder on the other
 CELL_DEG = 10.0
 _RINGS = round(180 / CELL_DEG)
 _LATITUDES = np.radians(-90 + CELL_DEG * (np.arange(_RINGS) + 0.5))
@@ -37,3 +45,12 @@ def cell_solid_angles() -> Float:
     edges = np.radians(-90 + CELL_DEG * np.arange(_RINGS + 1))
     ring = 2 * np.pi * np.diff(np.sin(edges)) / _AROUND
     return np.repeat(ring, _AROUND)
+
+
+def harmonics(direction: NDArray) -> NDArray:
+    """(..., 9) of unit directions (..., 3), in their float type."""
+    x, y, z = direction[..., 0], direction[..., 1], direction[..., 2]
+    a, b = direction.dtype.type(3**0.5), direction.dtype.type(15**0.5)
+    c = direction.dtype.type(0.5 * 5**0.5)
+    columns = [np.ones_like(x), a * x, a * y, a * z, b * x * y, b * y * z, b * x * z]
+    return np.stack([*columns, b / 2 * (x * x - y * y), c * (3 * z * z - 1)], axis=-1)

@@ -1,0 +1,143 @@
+"""How much light the lens spreads, from the halo round the subject on the background of the scan itself.
+
+    y = room(direction) + b_view + φ(u, v) + Σ g_k (K_k∗y - y),      g_k >= 0
+
+Room and field are of order 2, a cell of 10° may differ: a warm wall stays where it is, a halo goes with the subject.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import nnls
+from scipy.sparse import csr_matrix
+
+from ..geometry.sphere import cell_of, harmonics
+from ..physics.band import Band
+from ..physics.scatter import halo, reduced
+from ..physics.signal import SignalConverter
+from ..robust import MAD_PER_SIGMA, TUKEY, tukey_weight
+from ..types import Camera, Float, Float32, LensScatter, Observations, ThermalStream, ThermalViews
+from .background import SPREADS, Background
+
+ROWS = 30_000  # blocks of background that are asked, evenly
+LEAST_ROWS, LEAST_VIEWS = 3000, 8
+FOLDS = 6  # blocks of views that are left out in turn
+ROUNDS = 3  # of reweighting
+NOISE_K = 0.05  # of a block, to begin with
+WIDE_K = 5.0  # one sigma of what room, offsets and field may be
+CELL_K = 0.1  # of a cell about the room's harmonics: texture, no halo
+LEAST_SHARE, LEAST_SIGMAS = 0.003, 5.0  # of the light, below which no scatter is taken off
+MODEL_SIGMA, MODEL_SHARE = 0.0015, 0.08  # one sigma of the share: what point spread and field leave, and of its size
+SPREAD_VIEWS = 20  # that the effect on vertices is averaged over
+UNKNOWN_SIGMA, UNKNOWN_WIDTH = 0.005, 0.1  # one sigma of the share where no background shows it; image widths
+
+
+@dataclass(frozen=True, eq=False)
+class _Normal:
+    """Normal equations of some views: N (P, P), rhs (P,); the K shares first."""
+
+    N: Float
+    rhs: Float
+
+    def less(self, other: _Normal) -> _Normal:
+        return _Normal(self.N - other.N, self.rhs - other.rhs)
+
+    def shares(self, prior: Float, K: int) -> Float:
+        """(K,) g >= 0 of least cost, all else eliminated; prior (P,): inverse variances."""
+        N = self.N + np.diag(prior)
+        inverse = cho_factor(N[K:, K:])
+        S = N[:K, :K] - N[:K, K:] @ cho_solve(inverse, N[K:, :K])
+        q = self.rhs[:K] - N[:K, K:] @ cho_solve(inverse, self.rhs[K:])
+        root = np.linalg.cholesky(S)
+        return np.asarray(nnls(root.T, np.linalg.solve(root, q))[0])
+
+
+def unknown_scatter() -> LensScatter:
+    """None is known of, and some may be there."""
+    return LensScatter(((0.0, UNKNOWN_WIDTH),), UNKNOWN_SIGMA)
+
+
+def estimate_scatter(background: Background, lens: Camera, band: Band) -> LensScatter:
+    """The lens's scatter with its sigma; share 0 where the background shows none."""
+    views = np.unique(background.view)
+    if len(background) < LEAST_ROWS or len(views) < LEAST_VIEWS:
+        return unknown_scatter()
+    image_px = lens.width_px, lens.height_px
+    slope_L = float(band.d_radiance_dT(band.temperature_K(float(np.median(background.radiance)))))
+    rows = np.arange(0, len(background), max(1, -(-len(background) // ROWS)))
+    parts, prior = _normals(background, rows, image_px, slope_L)
+    K = len(SPREADS)
+    whole = _Normal(np.sum([p.N for p in parts], axis=0), np.sum([p.rhs for p in parts], axis=0))
+    shares = whole.shares(prior, K)
+    left_out = np.array([whole.less(p).shares(prior, K).sum() for p in parts])
+    jackknife = float(np.sqrt((FOLDS - 1) / FOLDS * ((left_out - left_out.mean()) ** 2).sum()))
+    share = float(shares.sum())
+    sigma = float(np.sqrt(jackknife**2 + MODEL_SIGMA**2 + (MODEL_SHARE * share) ** 2))
+    if share < max(LEAST_SHARE, LEAST_SIGMAS * jackknife):
+        return LensScatter(((0.0, UNKNOWN_WIDTH),), sigma)
+    return LensScatter(tuple((float(g), w) for g, w in zip(shares, SPREADS, strict=True) if g > 0), sigma)
+
+
+def _normals(
+    background: Background, rows: NDArray, image_px: tuple[int, int], slope_L: float
+) -> tuple[list[_Normal], Float]:
+    """Normal equations by block of views, and the prior's inverse variances (P,)."""
+    direction, view = background.direction[rows].astype(np.float64), background.view[rows]
+    _, view = np.unique(view, return_inverse=True)
+    cells, cell = np.unique(cell_of(direction), return_inverse=True)
+    x, y_px = (2 * background.u_px[rows] / image_px[0] - 1), (2 * background.v_px[rows] / image_px[1] - 1)
+    y = background.radiance[rows].astype(np.float64)
+    design = np.column_stack(
+        [background.spread[rows] - y[:, None], harmonics(direction), x, y_px, x * x, x * y_px, y_px * y_px]
+    )
+    R, n, M, C = len(rows), design.shape[1], int(view.max()) + 1, len(cells)
+    index = np.column_stack([np.tile(np.arange(n), (R, 1)), n + view, n + M + cell])
+    value = np.column_stack([design, np.ones((R, 2))])
+    A = csr_matrix((value.ravel(), index.ravel(), np.arange(0, R * (n + 2) + 1, n + 2)), shape=(R, n + M + C))
+    y = y - np.median(y)
+    K = len(SPREADS)
+    wide, texture = (WIDE_K * slope_L) ** -2, (CELL_K * slope_L) ** -2
+    prior = np.concatenate([np.zeros(K), np.full(n - K + M, wide), np.full(C, texture)])
+    weak = np.concatenate([np.ones(K), np.zeros(len(prior) - K)])
+    robust, sigma = np.ones(R), NOISE_K * slope_L
+    for _ in range(ROUNDS):
+        w = robust / sigma**2
+        N = (A.T @ A.multiply(w[:, None]).tocsr()).toarray() + np.diag(prior + weak)
+        r = np.abs(y - A @ cho_solve(cho_factor(N), A.T @ (w * y)))
+        sigma = max(float(np.median(r)) / MAD_PER_SIGMA, 1e-3 * NOISE_K * slope_L)
+        robust = tukey_weight(r / (TUKEY * sigma))
+    block, parts = view * FOLDS // M, []
+    w = robust / sigma**2
+    for fold in range(FOLDS):
+        mine = np.flatnonzero(block == fold)
+        a = A[mine]
+        parts.append(_Normal((a.T @ a.multiply(w[mine, None]).tocsr()).toarray(), a.T @ (w[mine] * y[mine])))
+    return parts, prior
+
+
+def spread_on(
+    stream: ThermalStream, views: ThermalViews, converter: SignalConverter, observations: Observations, n_vertices: int
+) -> Float32:
+    """(V,) Σ g_k (K_k∗y - y) of the converter's scatter, all of the light spread: what errors of its share do to each
+    vertex in the mean of some views, W m-2 sr-1."""
+    scatter = (converter.scatter or unknown_scatter()).unit
+    chosen = np.unique(np.linspace(0, len(views) - 1, min(SPREAD_VIEWS, len(views))).round().astype(int))
+    edges = np.searchsorted(observations.view, np.arange(len(views) + 1))
+    total, count = np.zeros(n_vertices), np.zeros(n_vertices)
+    for view in chosen.tolist():
+        frame, mine = int(views.frame[view]), slice(edges[view], edges[view + 1])
+        coarse = reduced(converter.radiance(stream.load(frame), stream.places[frame]))
+        added = halo(coarse, scatter) - coarse
+        scale = stream.camera.lens.width_px / coarse.shape[1]
+        row = np.clip(observations.v_px[mine] / scale, 0, coarse.shape[0] - 1).astype(int)
+        column = np.clip(observations.u_px[mine] / scale, 0, coarse.shape[1] - 1).astype(int)
+        total += np.bincount(observations.vertex[mine], added[row, column], n_vertices)
+        count += np.bincount(observations.vertex[mine], minlength=n_vertices)
+    seen = count > 0
+    out = np.full(n_vertices, np.median(total[seen] / count[seen]) if seen.any() else 0.0, np.float32)
+    out[seen] = total[seen] / count[seen]
+    return out
