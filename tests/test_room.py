@@ -13,10 +13,12 @@ from test_surroundings import sphere_part
 from thermofusion.diagnosis.radiation import of_room
 from thermofusion.geometry.sphere import N_CELLS, cell_directions, cell_of, cell_solid_angles, harmonics
 from thermofusion.mapping.background import SPREADS, Background, find_background
+from thermofusion.physics.emissivity import Fresnel
 from thermofusion.physics.signal import SignalConverter
 from thermofusion.temperature import crosscal
 from thermofusion.temperature.room.harmonics import open_transfer
 from thermofusion.temperature.room.map import RoomMap, RoomPrior
+from thermofusion.temperature.room.operator import operator_effect, operator_excess, without_operator
 from thermofusion.temperature.room.surroundings import surroundings
 from thermofusion.temperature.room.survey import survey
 from thermofusion.temperature.room.witness import sides_of
@@ -203,3 +205,20 @@ def test_background_leaves_out_the_subject_its_legs_sources_and_masks():
     assert np.abs(degC - 22).max() < 0.1
     assert len(found) > 0.5 * (~(disc | legs)).sum() / found.block_px**2
     np.testing.assert_allclose(np.linalg.norm(found.direction, axis=1), 1, atol=1e-5)
+
+
+def test_the_operator_is_taken_off_in_closed_form():
+    """Golden: .5 m² of 29 °C, 1 m before skin seen straight on, fills .159 of its hemisphere."""
+    rows = make_world(1, n_vertices=500, n_views=6).observations
+    straight = replace(rows, cos_angle=np.ones_like(rows.cos_angle), range_m=np.ones_like(rows.range_m))
+    excess = operator_excess(straight, Fresnel(1.33), BAND, REFLECTED_K)
+    warmer = float(BAND.radiance(302.15)) - L_ROOM
+    np.testing.assert_allclose(0.5 * excess, (1 - 0.9799406878) * 0.5 / np.pi * warmer, rtol=1e-5)
+    excess = operator_excess(rows, Fresnel(1.33), BAND, REFLECTED_K)
+    with_it = replace(rows, radiance=rows.radiance + np.float32(0.5) * excess)
+    np.testing.assert_allclose(without_operator(with_it, excess, 0.5).radiance, rows.radiance, atol=1e-5)
+    assert without_operator(rows, excess, 0.0) is rows
+    effect = operator_effect(rows, excess, rows.cos_angle > 0.5, 500)
+    seen = np.bincount(rows.vertex[rows.cos_angle > 0.5], minlength=500) > 0
+    assert (effect[seen] > 0).all()
+    assert (effect[~seen] == 0).all()

@@ -198,11 +198,12 @@ class TemperatureSection(_Section):
     sigma_reflected_K: float = Field(
         0.5, ge=0, le=100, description="of the reflected temperature, measured with crumpled foil"
     )
+    operator_m2: float = Field(
+        0.0, ge=0, le=5, description="body of who holds the camera, 29 °C warm, that the skin reflects; m²"
+    )
+    sigma_operator_m2: float = Field(0.3, ge=0, le=5, description="of that area: 0.5 m² is a person at arm's length")
     sigma_room_K: float = Field(
-        2.0,
-        ge=0,
-        le=100,
-        description="half the difference between opposite walls, where nothing shows it",
+        2.0, ge=0, le=100, description="half the difference between opposite walls, where nothing shows it"
     )
     sigma_normal_deg: float | None = Field(
         None, ge=0, le=45, description="of surface normals; None = estimated from depth noise and window"

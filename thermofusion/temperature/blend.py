@@ -205,8 +205,8 @@ def _blend(rows: Observations, groups: Groups, problem: ThermalProblem, task: _T
         if task.with_uncertainty:
             levers = _levers(rows, mean, solved, task, errors, problem.room_errors(groups.vertex))
             parts, common, modes = _errors_of(levers, x, band.temperature_K(L_s), columns, task, errors)
-            if problem.scattered is not None:
-                common["scatter"] = problem.scattered[groups.vertex] / (task.slope_L * task.epsilon0)
+            for name, effect in problem.effects.items():
+                common[name] = effect[groups.vertex] / (task.slope_L * task.epsilon0)
     columns |= {"absolute_K": band.temperature_K(L_s), "normal_equivalent_K": band.temperature_K(L0)}
     return _Block(groups.vertex, columns, parts, common, modes)
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from ..types import Bool, Camera, Float, Float32, Int, Observations, Scan, Surfa
 from .references import ContactReading, ExpectedReading, contact_readings, expected_readings
 from .room.harmonics import open_transfer
 from .room.map import RoomMap, RoomPrior
+from .room.operator import operator_effect, operator_excess, without_operator
 from .room.stated import ASSUMED_SIGMA_K, Room, room_of
 from .room.surroundings import SurroundingsResult, surroundings
 from .uncertainty import ErrorModel
@@ -38,8 +40,8 @@ class ThermalProblem:
     vertices are a sample. errors : one-sigma parts of an observation. blackbodies, contacts : what sets the level.
     vertices_per_patch : vertices that share a normal's error. other : (V,) what is not skin, None = not asked.
     room_map : radiance of the room from each direction; None: even, as stated. transfer : (V, 9) how its harmonics
-    light a vertex. uneven : (V,) what the room adds to what vertices reflect, beyond its mean. scattered : (V,) what
-    one sigma of the lens's scatter does to readings of a vertex.
+    light a vertex. uneven : (V,) what the room adds to what vertices reflect, beyond its mean. effects : (V,)
+    what one sigma of the lens's scatter, or of who stands at the camera, does to readings of a vertex.
     """
 
     vertices: NDArray[np.intp]
@@ -66,7 +68,7 @@ class ThermalProblem:
     room_map: RoomMap | None = None
     transfer: Float32 | None = None
     uneven: Float | None = None
-    scattered: Float32 | None = None
+    effects: Mapping[str, Float32] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -88,10 +90,14 @@ class ThermalProblem:
         L_room = float(band.radiance(room.reflected_K))
         L_air = float(band.radiance(room.air_K or room.reflected_K))
         rows = remove_air_path(mapped.observations, settings.transmission_per_m, L_air)
+        emissivity = model_from_recipe(settings.emissivity, band)
+        excess = operator_excess(rows, emissivity, band, room.reflected_K)
+        rows = without_operator(rows, excess, settings.operator_m2)
         clear, counts = clear_of_silhouettes(rows, len(surface), mapping.silhouette_px)
-        rows, clear = rows.select(counts), clear[counts]
+        rows, clear, excess = rows.select(counts), clear[counts], excess[counts]
         around = surroundings(surface) if settings.crosscal.surroundings else None
         straight = rows.cos_angle >= np.float32(np.cos(np.radians(mapping.max_angle_deg)))
+        held = settings.sigma_operator_m2 * operator_effect(rows, excess, straight, len(surface))
         straight_seen = np.bincount(rows.vertex[straight], minlength=len(surface)) > 0
         problem = cls(
             vertices=np.arange(len(surface)),
@@ -104,7 +110,7 @@ class ThermalProblem:
             restarts=_restarts(scan.thermal.usable, mapped.views.frame),
             lens=camera.lens,
             band=band,
-            emissivity=model_from_recipe(settings.emissivity, band),
+            emissivity=emissivity,
             room=room,
             L_reflected=np.full(len(surface), L_room),
             around=around,
@@ -114,7 +120,7 @@ class ThermalProblem:
             vertices_per_patch=vertices_per_patch(surface, normal_window_m),
             mapping=mapping,
             settings=settings,
-            scattered=mapped.scattered,
+            effects={"operator": held} | ({} if mapped.scattered is None else {"scatter": mapped.scattered}),
             room_map=RoomMap.unseen(_room_prior(room, settings, band)),
             transfer=open_transfer(surface.normals).astype(np.float32) if around is None else around.transfer,
         )
@@ -223,7 +229,7 @@ class ThermalProblem:
             L_reflected=self.L_reflected[chosen],
             transfer=None if self.transfer is None else self.transfer[chosen],
             uneven=None if self.uneven is None else self.uneven[chosen],
-            scattered=None if self.scattered is None else self.scattered[chosen],
+            effects={name: effect[chosen] for name, effect in self.effects.items()},
             around=None,
             errors=replace(self.errors, gradient_K_per_m=gradient[chosen]),
             contacts=tuple(c for c in contacts if len(c.vertices)),

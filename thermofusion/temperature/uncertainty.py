@@ -22,7 +22,7 @@ DEFAULT_PSF_PX = 0.7  # point spread of a microbolometer camera in focus, where 
 EDGE_MARGIN_PX = 0.5  # fused surfaces shrink or swell by about this much of a thermal pixel
 BILINEAR_VARIANCE = 4 / 9  # mean over sub-pixel positions of the noise variance left by bilinear sampling
 AIR_LOSS_PER_M = 0.006  # 1-τ of a metre of room air at 50 % humidity, 7.5-13.5 µm (62 mK at 10 K contrast)
-LINKED_EPSILON0_SIGMA = 0.003  # of ε(0) where it follows the fitted shape of a smooth surface
+LINKED_EPSILON0_SIGMA = 0.005  # of ε(0) of skin in the literature, also where it follows the fitted shape
 ALONG_SURFACE = 2**-0.5  # share of a shift away from the body's middle that runs along its surface
 MAX_LEVER = 4.0  # bound on a normal error's lever near grazing, where the linear form no longer holds
 
