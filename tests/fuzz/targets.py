@@ -39,7 +39,7 @@ from thermofusion.files.tum import read_trajectory
 from thermofusion.judge.compare import load_temperatures
 from thermofusion.judge.contacts import read_contacts
 from thermofusion.recipe import load_recipe
-from thermofusion.recording.record import Until, record
+from thermofusion.recording.record import Beside, Until, record
 from thermofusion.results.artifacts import load_artifact, load_note, save_artifact
 from thermofusion.scans import open_scan, with_rig
 from thermofusion.scans.check import verify
@@ -210,8 +210,12 @@ def _open_maker(root: Path, name: str) -> None:
 
 def _recording(root: Path) -> None:
     """recording.mcap with eight small frames of two streams."""
-    devices = [partial(Steady, rate_hz=500.0, frames=8), partial(Steady, "heat", "thermal", 500.0, 8)]
-    record(devices, root, Until(), own_process=False)
+    warm = {"kind": "counts", "curve": {"type": "linear_kelvin", "gain_K": 0.01, "offset_K": 250.0}}
+    heat = partial(Steady, "heat", "thermal", 500.0, 8, signal=warm)
+    thermal = {"width_px": 64, "height_px": 48, "K": K}
+    rig = {"cameras": {"thermal": thermal}, "extrinsics": {"T_thermal_depth": T}}
+    beside = Beside({"environment": {"air_degC": 21.0}}, rig)
+    record([partial(Steady, rate_hz=500.0, frames=8), heat], root, Until(), beside=beside, own_process=False)
 
 
 def _mkv() -> bytes:

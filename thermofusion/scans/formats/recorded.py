@@ -25,7 +25,7 @@ from ...files.reading import COPY_AGAIN, MAX_PIXELS, open_regular, read_head
 from ...files.ros import FRAME_INFO, IMAGE, VECTOR, FrameInfo, Picture, read_frame_info, read_picture, read_vector
 from ...files.strict import validated
 from ...geometry.rigid import pose
-from ...types import Camera, Environment, Float, Reference, Scan, Stream, ThermalCamera
+from ...types import Camera, Environment, Float, Reference, Scan, Stream
 from ..clock import ClockFit, fit_clock
 from ..common import Kind, as_thermal, make_camera, make_rig, make_stream
 from ..native.compose import with_rig
@@ -37,6 +37,10 @@ LAST_CHECKED = 8  # frames at the end of a torn file whose checksums must be rig
 MAX_MESSAGE = 64 * 2**20  # bytes of a message that is read
 MAX_BACK = 0.01  # share of frames whose device clock may repeat or run backwards
 MAX_WHERE = 4  # gaps that a note names
+# What is believed of a file, as scan.json has it.
+UNITS_M, BASELINE_M, BAND_UM = (1e-6, 0.1), (-10.0, 10.0), (1.0, 30.0)
+KINECT_BOUNDS = {"emitter_cm": (1.0, 30.0), "reference_cm": (10.0, 1000.0), "pixel_cm": (0.01, 1.0)}
+KINECT_BOUNDS["const_shift"] = (1.0, 2047.0)
 STILL_G = (0.9, 1.1)  # an accelerometer that reads so is at rest
 
 
@@ -107,16 +111,16 @@ def _scan_of(index: McapIndex, path: Path, stated: Stated, infos: dict[int, Fram
     clocks, said_of_clocks = _clocks([s for own in kinds.values() for s in own], start_ns)
     depth = kinds["depth"][0]
     camera = stated.camera("depth") or _camera(depth, file)
-    unit_m = stated.unit_m(float(str(depth.about.get("depth_unit_m", 0.001))))
+    unit_m = stated.unit_m(_within(depth.about.get("depth_unit_m"), UNITS_M, 0.001))
     scan = Scan(
         name=path.resolve().name if path.is_dir() else path.resolve().stem,
         root=path,
         format="recording",
         rig=make_rig(camera, place=file),
-        depth=_stream(file, depth, clocks, _depth_decoder(depth, unit_m)),
+        depth=_stream(file, depth, clocks, camera, _depth_decoder(depth, unit_m)),
         depth_unit_m=unit_m,
         environment=_environment(said.get("environment", "{}")),
-        recorded_at=datetime.fromtimestamp(start_ns / 1e9, UTC).isoformat(timespec="seconds"),
+        recorded_at=_date(start_ns),
         notes=(
             *_losses(index, streams, whole, start_ns, said),
             *said_of_clocks,
@@ -133,10 +137,29 @@ def _scan_of(index: McapIndex, path: Path, stated: Stated, infos: dict[int, Fram
 
 def _environment(text: str) -> Environment:
     try:
-        given = {k: float(v) for k, v in json.loads(text).items() if k in Environment.__dataclass_fields__}
-    except (ValueError, TypeError, AttributeError):
+        given = json.loads(text).items()
+    except (ValueError, AttributeError, RecursionError):
         return Environment()
-    return Environment(**given)
+    bounds = dict.fromkeys(Environment.__dataclass_fields__, (-80.0, 150.0))  # as scan.json has them
+    bounds["relative_humidity_pct"] = (0.0, 100.0)
+    known = {k: _within(v, bounds[k], np.nan) for k, v in given if k in bounds}
+    return Environment(**{k: v for k, v in known.items() if v == v})
+
+
+def _date(unix_ns: int) -> str | None:
+    try:
+        return datetime.fromtimestamp(unix_ns / 1e9, UTC).isoformat(timespec="seconds")
+    except (OverflowError, ValueError, OSError):
+        return None
+
+
+def _within(value: object, bounds: tuple[float, float], default: float) -> float:
+    """A number of a file, if it is one within the bounds."""
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        return default
+    return number if bounds[0] <= number <= bounds[1] else default
 
 
 def _references(text: str, scan: Scan, file: Path) -> tuple[Reference, ...]:
@@ -145,7 +168,7 @@ def _references(text: str, scan: Scan, file: Path) -> tuple[Reference, ...]:
 
     try:
         rows = json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         rows = []
     if scan.thermal is None or not isinstance(rows, list):
         return ()
@@ -171,7 +194,7 @@ def _stream_of(index: McapIndex, channel: int, known: dict[int, FrameInfo]) -> _
                 index.damaged.append(e.offset)
     try:
         about = json.loads(own.metadata.get(ABOUT, "{}"))
-    except ValueError:
+    except (ValueError, RecursionError):
         about = {}
     found = {e.sequence: e for e in index.messages if e.channel == channel and e.sequence in infos}
     frames = [found[k] for k in sorted(found)]
@@ -225,9 +248,15 @@ def _pixels(picture: Picture, place: object) -> NDArray:
     return np.frombuffer(picture.pixels, dtype).reshape(shape)
 
 
-def _stream(file: Path, stream: _Recorded, clocks: Mapping[str, Float], decode: Callable[[NDArray], NDArray]) -> Stream:
+def _stream(
+    file: Path, stream: _Recorded, clocks: Mapping[str, Float], camera: Camera, decode: Callable[[NDArray], NDArray]
+) -> Stream:
     kind: Kind = stream.kind  # type: ignore[assignment]
-    size = int(stream.channel.metadata.get("height_px", 0)), int(stream.channel.metadata.get("width_px", 0))
+    said = stream.channel.metadata
+    size = _number(said.get("height_px"), 0), _number(said.get("width_px"), 0)
+    if camera.shape != size:
+        said_px = f"{camera.width_px} x {camera.height_px} px, but its images have {size[1]} x {size[0]}"
+        raise ScanError(f"the {kind} camera has {said_px}", place=file, hint="is the rig.json that of these cameras?")
     times = clocks[stream.channel.topic]
     rows = np.flatnonzero(times > np.concatenate([[-np.inf], np.maximum.accumulate(times)[:-1]]))
 
@@ -268,10 +297,10 @@ def _depth_decoder(stream: _Recorded, unit_m: float) -> Callable[[NDArray], NDAr
 
 def _kinect(stream: _Recorded) -> KinectDepth:
     said = stream.about.get("kinect_depth")
-    try:
-        return KinectDepth(**{k: float(v) for k, v in said.items()}) if isinstance(said, dict) else KinectDepth()
-    except (TypeError, ValueError):
+    if not isinstance(said, dict):
         return KinectDepth()
+    typical = vars(KinectDepth())
+    return KinectDepth(**{k: _within(said.get(k), KINECT_BOUNDS[k], v) for k, v in typical.items()})
 
 
 def _color(raw: NDArray) -> NDArray[np.uint8]:
@@ -345,12 +374,13 @@ def _fitted(streams: list[_Recorded], arrivals: list[Float]) -> tuple[ClockFit, 
     """The one clock of a device's streams, and their times by it; None where it has none that can be believed."""
     said = [s.channel.metadata for s in streams]
     rates = {_number(m.get("tick_hz"), 0) for m in said}
-    if len(rates) != 1 or 0 in rates:
+    if len(rates) != 1 or min(rates) <= 0:
         return None
     host = np.concatenate(arrivals)
+    wrap = max(_number(said[0].get("tick_wrap"), 2**32), 2)
     ticks = np.concatenate([np.array([float(i.ticks) for i in s.infos]) for s in streams])
     order = np.argsort(host, kind="stable")
-    fit = fit_clock(host[order], ticks[order], float(rates.pop()), _number(said[0].get("tick_wrap"), 2**32))
+    fit = fit_clock(host[order], ticks[order], float(rates.pop()), wrap)
     on_host = np.empty(len(order))
     on_host[order] = fit.times_s
     times = np.split(on_host, np.cumsum([len(a) for a in arrivals])[:-1])
@@ -377,31 +407,35 @@ def _camera(stream: _Recorded, file: Path) -> Camera:
 
 def _with_color(scan: Scan, file: Path, color: _Recorded, clocks: Mapping[str, Float], stated: Stated) -> Scan:
     camera = stated.camera("color") or _camera(color, file)
-    shift = color.about.get("T_color_depth_m", [0, 0, 0])
-    T_color_depth = pose(np.eye(3), np.array(shift, np.float64).reshape(3))
+    shift = color.about.get("T_color_depth_m")
+    place = shift if isinstance(shift, list) and len(shift) == 3 else [0.0, 0.0, 0.0]
+    T_color_depth = pose(np.eye(3), np.array([_within(x, BASELINE_M, 0.0) for x in place]))
     rig = make_rig(scan.rig.depth, camera, T_color_depth, place=file)
-    return replace(scan, rig=rig, color=_stream(file, color, clocks, _color), notes=(*scan.notes, *_assumed(color)))
+    return replace(
+        scan, rig=rig, color=_stream(file, color, clocks, camera, _color), notes=(*scan.notes, *_assumed(color))
+    )
 
 
 def _with_thermal(scan: Scan, file: Path, thermal: _Recorded, clocks: Mapping[str, Float], stated: Stated) -> Scan:
     """The scan with thermal, where a rig.json says where its camera sits, and the device or it what its counts are."""
-    group = None if stated.rig is None else stated.rig.cameras.thermal
-    T = None if stated.rig is None else stated.rig.extrinsics.T_thermal_depth
-    camera, signal = stated.camera("thermal"), thermal.about.get("signal")
-    if camera is None or T is None or (signal is None and (group is None or group.signal is None)):
+    rig, signal = stated.rig, thermal.about.get("signal")
+    group = None if rig is None else rig.cameras.thermal
+    told = signal is not None or (group is not None and group.signal is not None)
+    if rig is None or group is None or rig.extrinsics.T_thermal_depth is None or not told:
         what = f"thermal ({thermal.channel.topic}) is left out: a rig.json beside it with cameras.thermal"
         more = " and its signal (this camera tells only relative values)" if thermal.about.get("relative") else ""
         text = f"{what}{more} and extrinsics.T_thermal_depth brings it in"
         return replace(scan, notes=(*scan.notes, text))
-    from ..native.schema import SignalDoc, signal_of
+    from ..native.schema import SignalDoc, signal_of, thermal_camera_of
 
     band = thermal.about.get("band_um")
-    own = ThermalCamera(camera, np.array(T))
-    if signal is not None:
+    own = thermal_camera_of(group, rig.extrinsics, stated.rig_path or file)
+    if signal is not None and group.signal is None:
         own = replace(own, signal=signal_of(validated(SignalDoc, signal, file), file))
-    if isinstance(band, list) and len(band) == 2:
-        own = replace(own, band_um=(float(band[0]), float(band[1])))
-    return replace(scan, thermal=as_thermal(_stream(file, thermal, clocks, np.array), own))
+    if isinstance(band, list) and len(band) == 2 and "band_um" not in group.model_fields_set:
+        low, high = (_within(x, BAND_UM, np.nan) for x in band)
+        own = replace(own, band_um=(low, high)) if low + 0.1 < high else own
+    return replace(scan, thermal=as_thermal(_stream(file, thermal, clocks, own.lens, np.array), own))
 
 
 # ---------------------------------------------------------------- what is said
@@ -434,7 +468,7 @@ def _losses(
         return notes
     end_s = (max((e.log_ns for e in index.messages), default=start_ns) - start_ns) * 1e-9
     text = f"the recording breaks off after {end_s:.2f} s, at byte {index.torn_at:,}, without its end"
-    flush_s = float(said.get("flush_s", 0.5))
+    flush_s = _within(said.get("flush_s"), (0.0, 60.0), 0.5)
     notes.append(f"{text} (crash, kill or power cut): what was in memory, {flush_s:g} s at most, is lost")
     if index.cut is not None and index.cut[0] in index.channels:
         topic, number = index.channels[index.cut[0]].topic, index.cut[2]

@@ -291,7 +291,10 @@ def _with_thermal(
         if T is None and own is None:
             text += f", and extrinsics.T_thermal_depth: no static transform from {depth.frame} to {topic.frame}"
         return replace(scan, notes=(*scan.notes, text))
-    camera = ThermalCamera(_camera(infos, topic, scan.root), np.array(own) if T is None else T)
+    try:
+        camera = ThermalCamera(_camera(infos, topic, scan.root), np.array(own) if T is None else T)
+    except ValueError as e:
+        raise ScanError(str(e), place=stated.rig_path or scan.root) from None
     return replace(scan, thermal=as_thermal(_stream(reader, topic, "thermal", scan.root), camera))
 
 
