@@ -19,9 +19,10 @@ from thermofusion.pipeline import fuse
 from thermofusion.recipe import load_recipe
 from thermofusion.rig.edges import find_edges, smooth_image
 from thermofusion.rig.free.limb import limb_shift_px
-from thermofusion.scans import open_scan
+from thermofusion.scans import open_scan, with_thermal
 from thermofusion.scans.check import check_scan
 from thermofusion.scans.native.write import write_scan
+from thermofusion.scans.thermal import ThermalSaid, read_thermal
 
 HOURS_LATER_S = 7200.0
 WALK = {"radius_m": 1.15, "height_from_m": 1.35, "height_to_m": 1.3, "look_from_m": 1.2, "look_to_m": 1.2}
@@ -149,3 +150,18 @@ def test_a_round_subject_is_refused_for_it_looks_alike_from_every_side(tmp_path)
     scan = open_scan(simulate(scene_from_mapping(scene), tmp_path / "scan", seed=1))
     with pytest.raises(ScanError, match="from several sides"):
         fuse(scan, load_recipe("phantom-cylinder"))
+
+
+def test_frames_of_another_clock_join_by_their_lens_alone(recorded, tmp_path):
+    scan = open_scan(recorded)
+    document = json.loads((recorded / "scan.json").read_text())
+    lens = {k: v for k, v in document["cameras"]["thermal"].items() if k != "mount"}
+    rig = tmp_path / "rig.json"
+    rig.write_text(json.dumps({"cameras": {"thermal": lens}}))
+    camera = scan.thermal.camera
+    frames = read_thermal(recorded / "thermal", ThermalSaid(curve=camera.signal), camera.lens.shape)
+    with pytest.raises(ScanError, match="--free"):
+        with_thermal(replace(scan, thermal=None), frames, rig)
+    joined = with_thermal(replace(scan, thermal=None), frames, rig, free=True)
+    assert joined.thermal.camera.mount == "free"
+    assert len(joined.thermal) == 12

@@ -217,7 +217,8 @@ def _extrinsic(extrinsics: ExtrinsicsDoc, name: str, path: Path) -> np.ndarray:
     key = f"T_{name}_depth"
     rows = getattr(extrinsics, key)
     if rows is None:
-        raise ScanError(f"key 'extrinsics.{key}' is needed for the {name} camera", place=path)
+        hint = 'a camera that is not on the rig: set cameras.thermal.mount to "free"' if name == "thermal" else None
+        raise ScanError(f"key 'extrinsics.{key}' is needed for the {name} camera", place=path, hint=hint)
     return matrix_of(rows, f"extrinsics.{key}", path)
 
 
