@@ -390,6 +390,24 @@ def test_a_devices_clock_is_found_under_its_delays(drift, jump):
     assert fit.delay_s == pytest.approx(np.median(arrivals - true) - 0.004, abs=5e-4)
 
 
+def test_frames_that_wait_at_the_start_keep_their_times():
+    true = np.arange(60) / 15.0
+    slow = 2.2 + np.arange(60) * 0.004  # a process that started late hands over what waited
+    arrivals = np.maximum(true + 0.002, slow)
+    fit = fit_clock(arrivals, (true * 1e6).astype(np.int64), 1e6, 2**32)
+    assert fit.used
+    assert np.abs(fit.times_s - 0.002 - true).max() < 1e-4
+
+
+def test_a_host_that_stood_still_is_no_jump_of_the_devices_clock():
+    true = np.arange(600) / 30.0
+    arrivals = true + 0.003
+    arrivals[300:330] = np.maximum(arrivals[300:330], arrivals[329] + np.arange(30) * 1e-4)  # a second late, at once
+    fit = fit_clock(arrivals, (true * 1e6).astype(np.int64), 1e6, 2**32)
+    assert fit.jumps == 0
+    assert np.abs(fit.times_s - 0.003 - true).max() < 1e-4
+
+
 def test_a_clock_that_is_none_is_not_believed():
     host = np.arange(300) / 30.0
     assert not fit_clock(host, np.random.default_rng(1).integers(0, 2**32, 300), 60e6, 2**32).used

@@ -26,7 +26,7 @@ from ..types import Camera, Scan, Stream
 from .device import POLL_S, Device, EndOfStreamError, Frame, StreamInfo, StreamKind
 
 TICKS_HZ = 1e6  # of the clock that a scan's times are replayed as
-START_S = 1.5  # from the start of a recording until replayed frames come: devices are processes, which take a while
+START_S = 3.0  # from the start of a recording until replayed frames come: devices are processes, which take a while
 BEFORE_S = 1000.0  # on the replayed clock when depth begins: thermal may begin before
 FRAMES_AHEAD = 4  # frames that are due at once are handed over together
 

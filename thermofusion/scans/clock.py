@@ -11,6 +11,7 @@ from ..types import Float
 
 MAX_DRIFT = 1e-3  # of a device's clock against its nominal rate: crystals are within 1e-4, firmware rounds
 FEWEST, SHORTEST_S = 30, 2.0  # frames, and span, from which a drift can be told
+PROMPT_S, PROMPT_SHARE = 0.02, 0.2  # without a drift, so many frames must lie so near above the line
 JUMP_S = 0.5  # device and host part by so much between two frames: the counter began anew
 
 
@@ -53,17 +54,23 @@ def fit_clock(host_s: NDArray, ticks: NDArray, tick_hz: float, wrap: int) -> Clo
     device = unwrapped_s(host, ticks, tick_hz, wrap)
     late = np.diff(host) - np.diff(device)
     cuts = np.flatnonzero(np.abs(late - np.median(late) if len(late) else late) > JUMP_S) + 1
-    times, drifts, parts = np.empty_like(host), [], np.split(np.arange(len(host)), cuts)
+    times, lines, parts = np.empty_like(host), [], np.split(np.arange(len(host)), cuts)
     for part in parts:
         slope, offset = _below(device[part], host[part])
-        if abs(slope - 1) > MAX_DRIFT:
-            return ClockFit(host, 0.0, 0.0, len(cuts), False)
+        if abs(slope - 1) > MAX_DRIFT:  # much came late, or it is no clock of that rate
+            slope, offset = 1.0, float(np.min(host[part] - device[part]))
+            prompt = np.mean(host[part] - device[part] - offset < PROMPT_S)
+            if prompt < PROMPT_SHARE:
+                return ClockFit(host, 0.0, 0.0, len(cuts), False)
         times[part] = offset + slope * device[part]
-        drifts.append(slope - 1)
+        lines.append((slope, offset))
     longest = int(np.argmax([len(p) for p in parts]))
     if len(cuts) * FEWEST > len(host):
         return ClockFit(host, 0.0, 0.0, len(cuts), False)
-    return ClockFit(times, float(drifts[longest]), float(np.median(host - times)), len(cuts))
+    # a host that stood still cuts too, but the lines before and after are one
+    apart = [abs((b[0] - a[0]) * device[k] + b[1] - a[1]) for a, b, k in zip(lines, lines[1:], cuts, strict=False)]
+    jumps = sum(d > JUMP_S / 10 for d in apart)
+    return ClockFit(times, lines[longest][0] - 1, float(np.median(host - times)), jumps)
 
 
 def _below(device: Float, host: Float) -> tuple[float, float]:
