@@ -31,6 +31,7 @@ from thermofusion.files.mcap import scan_mcap
 from thermofusion.recording import record as recorder
 from thermofusion.recording.devices import infiray, kinect
 from thermofusion.recording.record import Beside, Until, record
+from thermofusion.recording.replay import open_replay
 from thermofusion.recording.ring import Ring
 from thermofusion.recording.worker import Delivered, Ended, Started, Worker
 from thermofusion.scans import open_scan
@@ -434,8 +435,8 @@ def test_a_scan_played_as_devices_is_the_same_scan(tmp_path):
     blackbodies = [r for r in old.references if r.kind == "blackbody"]
     assert [(r.degC, r.frames) for r in new.references] == [(r.degC, r.frames) for r in blackbodies]
     assert blackbodies
-    again = CliRunner().invoke(app, [*arguments[:2], str(tmp_path / "rec"), *arguments[3:4], str(tmp_path / "again")])
-    assert again.exit_code == 0, again.output
+    opener = partial(open_replay, tmp_path / "rec", ("depth", "color"), time.monotonic_ns(), 20.0, None)
+    record([opener], tmp_path / "again", Until(), own_process=False)
     np.testing.assert_array_equal(open_scan(tmp_path / "again").depth.load(1), old.depth.load(1))
 
 
@@ -499,8 +500,6 @@ def test_a_device_whose_process_dies_is_said(tmp_path):
 
 
 def test_a_fakenect_folder_plays_as_a_kinect(tmp_path):
-    from thermofusion.recording.replay import open_replay
-
     taken = tmp_path / "taken"
     taken.mkdir()
     frames = [((np.arange(480 * 640) * 3 + 7 * k) % 2048).astype("<u2") for k in range(3)]

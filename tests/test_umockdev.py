@@ -126,7 +126,7 @@ def test_libfreenect_sees_the_same_depth(kinect, tmp_path):
     if shutil.which("fakenect-record") is None:
         pytest.skip("fakenect-record is not installed (apt install libfreenect-bin)")
     folder, depth, _ = kinect
-    command = ["timeout", "-s", "INT", "4", "fakenect-record", str(tmp_path / "taken")]
+    command = ["timeout", "-s", "INT", "3", "fakenect-record", str(tmp_path / "taken")]
     beside("kinect", folder, *command)
     files = sorted((tmp_path / "taken").glob("d-*.pgm"))
     taken = [read_pnm(f.read_bytes(), place=f, byteorder="<").ravel() for f in files]
