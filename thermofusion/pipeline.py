@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 # A stage is handed exactly the recipe sections that its key holds. It also depends on all stages before it.
 STAGES = (
     Stage("tracking", ("input", "subject", "tracking")),
-    Stage("surface", ("input", "subject", "surface"), edition=2),
+    Stage("surface", ("input", "subject", "surface"), edition=3),
     Stage("rig", ("input", "rig"), edition=3),
     Stage("mapping", ("input", "mapping"), edition=8),
     Stage("temperature", ("mapping", "temperature"), edition=8, handed_out=RESULT),

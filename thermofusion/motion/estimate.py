@@ -138,7 +138,9 @@ class _State:
         J = jacobian(points, field.node_m)
         rest = replace(self.graph, at_m=field.node_m)
         held = held_matrix(rest, edge_matrix(rest))
-        solved = solve_motion(sums, Normal.of(J), J, field.twist, held, step_weights(field.knot_s), 1 / CORRELATED)
+        solved = solve_motion(
+            sums, Normal.of(J), J, field.twist, held, step_weights(field.knot_s, field.twist), 1 / CORRELATED
+        )
         shift = np.clip(solved.shape_m, -MAX_SHIFT_M, MAX_SHIFT_M).astype(np.float32)
         points = replace(points, at_m=points.at_m + shift[:, None] * points.normal)
         T = se3_exp(unsteady(field, frames.times_s, steps)) @ frames.T_world_depth

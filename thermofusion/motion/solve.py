@@ -16,6 +16,7 @@ from .rows import Normal, Sums
 STRETCH_M, BEND_RAD = 4e-3, np.radians(3.4)  # between neighbours, one sigma: a joint between them must be able to bend
 STEP_M, STEP_RAD = 6e-3, np.radians(1.1)  # in `STEP_S`, one sigma
 STEP_S = 0.67
+JUMP_SIGMAS = 6.0  # of a step, turn and shift together
 SHAPE_M = 20e-3  # of the surface's error along its normal
 CG_STEPS, CG_TOLERANCE = 30, 0.02
 REST_M, REST_RAD = 40e-3, np.radians(9)  # towards rest
@@ -59,10 +60,15 @@ def held_matrix(graph: NodeGraph, rows: Float) -> Float:
     return H.transpose(0, 2, 1, 3).reshape(6 * k, 6 * k)
 
 
-def step_weights(knot_s: Float) -> Float:
-    """(F-1, 6) weights of a node's steps between knots: a random walk's."""
+def step_weights(knot_s: Float, twist: Float) -> Float:
+    """(F-1, K, 6) weights of the nodes' steps between knots: a random walk's, robust about twists (F, K, 6).
+
+    A foot that is set aside pays once: a step larger than `JUMP_SIGMAS` counts less and less (Cauchy).
+    """
     unit = np.array([STEP_RAD**-2.0] * 3 + [STEP_M**-2.0] * 3)
-    return (STEP_S / np.diff(knot_s))[:, None] * unit
+    weight = (STEP_S / np.diff(knot_s))[:, None, None] * unit
+    size2 = (weight * np.diff(twist, axis=0) ** 2).sum(2, keepdims=True)
+    return weight / (1 + size2 / JUMP_SIGMAS**2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +91,7 @@ def solve_motion(
     """
     F, m = len(twist), twist.shape[1] * 6
     old = twist.reshape(F, m)
-    flat = np.tile(steps, twist.shape[1])  # (F-1, m)
+    flat = steps.reshape(-1, m)
     seen = sums.own.copy()  # (F, P) a point's weight at each knot
     seen[:-1] += sums.next
     seen[1:] += sums.next
