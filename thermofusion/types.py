@@ -458,6 +458,19 @@ class SharedErrors:
         return cls(tuple(effects_K), np.round(columns / step).astype(np.int8), step, focal_px, normal_window_m)
 
 
+@dataclass(frozen=True)
+class BudgetInput:
+    """One input of an uncertainty budget: value and standard uncertainty u in `unit` (1 = none); kind "A" or "B" of the
+    GUM; freedom : its degrees of freedom, inf = many."""
+
+    name: str
+    value: float
+    u: float
+    unit: str
+    kind: str
+    freedom: float
+
+
 OutputMode = Literal["absolute", "normal-equivalent", "apparent"]
 
 

@@ -68,10 +68,11 @@ def measure(
 
     drawn = read_regions(regions)
     temperature = load_temperature(result)
-    measured = Measured.of(Measurer(temperature.mesh, temperature.shared), drawn)
+    measured = Measured.of(Measurer(temperature.mesh, temperature.shared, temperature.inputs), drawn)
     stem = out or result / "regions"
-    for suffix, text in ((".csv", measured.csv()), (".json", to_json(measured.document()) + "\n")):
+    files = {".csv": measured.csv(), "-budget.csv": measured.budget_csv(), ".json": to_json(measured.document()) + "\n"}
+    for suffix, text in files.items():
         write_text(stem.with_name(stem.name + suffix), text)
     emit(measured.document(), measured.csv().rstrip(), json)
     if not json:
-        note(f"wrote {stem}.csv and {stem}.json")
+        note(f"wrote {stem}.csv, {stem}-budget.csv and {stem}.json")

@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from ..types import Bool, Float, SharedErrors, ThermalMesh, VertexFlag
+from ..types import Bool, BudgetInput, Float, SharedErrors, ThermalMesh, VertexFlag
 from ..version import __version__
 from .body import Body, along
+from .budget import BudgetRow, UncertaintyBudget, of_difference, of_mean
 from .errors import MeanErrors, VertexErrors
 from .patch import Patch, patch_of
 from .region import Line, Region, Slab, Spot, opposite
@@ -64,7 +65,7 @@ class Reading:
 class Difference:
     """Two readings compared: delta_K = first - second, with one sigma; what both have in common cancels.
 
-    distance_mm : over the surface, between two spots.
+    distance_mm : over the surface, between two spots. budget : of sigma_K, input by input.
     """
 
     first: str
@@ -72,6 +73,11 @@ class Difference:
     delta_K: float
     sigma_K: float
     distance_mm: float = NAN
+    budget: UncertaintyBudget | None = None
+
+    def row(self) -> dict[str, Any]:
+        """The numbers, for a table."""
+        return {k: v for k, v in vars(self).items() if k != "budget"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,12 +86,15 @@ class Measured:
 
     readings: tuple[Reading, ...]
     differences: tuple[Difference, ...]
+    budgets: tuple[UncertaintyBudget, ...] = ()
 
     @classmethod
     def of(cls, measurer: Measurer, regions: Sequence[Region]) -> Measured:
         """Read every region, then compare."""
         readings = [measurer.read(region) for region in regions]
-        return cls(tuple(readings), tuple(measurer.differences(regions, readings)))
+        differences = tuple(measurer.differences(regions, readings))
+        budgets = [measurer.budget(reading) for reading in readings] + [d.budget for d in differences]
+        return cls(tuple(readings), differences, tuple(b for b in budgets if b is not None))
 
     @property
     def table(self) -> Any:
@@ -104,7 +113,12 @@ class Measured:
             for r in self.readings
         ]
         told = {"schema": MEASURED, "software": f"thermofusion {__version__}"}
-        return {**told, "regions": readings, "differences": [vars(d) for d in self.differences]}
+        return {
+            **told,
+            "regions": readings,
+            "differences": [d.row() for d in self.differences],
+            "budgets": [b.document() for b in self.budgets],
+        }
 
     def csv(self) -> str:
         """One line a region, then one a difference; an empty cell is not measured or does not apply."""
@@ -114,6 +128,18 @@ class Measured:
             row: dict[str, Any] = dict.fromkeys(keys, "") | {"name": f"{d.first} - {d.second}", "kind": "difference_K"}
             row |= {"value_degC": d.delta_K, "sigma_K": d.sigma_K, "length_mm": d.distance_mm}
             lines.append(list(row.values()))
+        text = StringIO()
+        writer(text, lineterminator="\n").writerows([_cell(x) for x in line] for line in lines)
+        return text.getvalue()
+
+    def budget_csv(self) -> str:
+        """One line an input of each quantity, then its combined and expanded (k = 2) uncertainty, K."""
+        keys = list(BudgetRow.__dataclass_fields__)
+        lines: list[list[Any]] = [["quantity", *keys]]
+        for budget in self.budgets:
+            lines += [[budget.quantity, *vars(row).values()] for row in budget.rows]
+            for name, size in (("combined", budget.combined_K), ("expanded (k = 2)", budget.expanded_K)):
+                lines.append([budget.quantity, name, NAN, NAN, "K", "", budget.freedom, NAN, size])
         text = StringIO()
         writer(text, lineterminator="\n").writerows([_cell(x) for x in line] for line in lines)
         return text.getvalue()
@@ -129,9 +155,12 @@ def _cell(x: Any) -> str:
 class Measurer:
     """Reads regions of one mesh."""
 
-    def __init__(self, mesh: ThermalMesh, shared: SharedErrors | None = None) -> None:
-        """shared : what the vertices' errors have in common (`Temperature.shared`); None: nothing averages."""
-        self.mesh, self.shared, self.body = mesh, shared, Body.of(mesh)
+    def __init__(
+        self, mesh: ThermalMesh, shared: SharedErrors | None = None, inputs: Sequence[BudgetInput] = ()
+    ) -> None:
+        """shared : what the vertices' errors have in common (`Temperature.shared`); None: nothing averages. inputs :
+        what temperatures depend on (`Temperature.inputs`)."""
+        self.mesh, self.shared, self.inputs, self.body = mesh, shared, tuple(inputs), Body.of(mesh)
 
     @cached_property
     def errors(self) -> VertexErrors:
@@ -170,6 +199,12 @@ class Measurer:
         found |= {"measured_fraction": area / patch.area_m2}
         return self._reading(region, mean, self.errors.of_area(patch, area), **size, **found)
 
+    def budget(self, reading: Reading) -> UncertaintyBudget | None:
+        """Of a reading on an absolute scale, else about the level common to the body; None = nothing measured."""
+        if reading.errors is None or not np.isfinite(reading.sigma_K):
+            return None
+        return of_mean(reading.name, reading.errors, self.inputs, absolute=bool(np.isfinite(reading.sigma_absolute_K)))
+
     def differences(self, regions: Sequence[Region], readings: Sequence[Reading]) -> list[Difference]:
         """Left less right of regions that are named alike, and every other spot less the next."""
         sides = {key: k for k, region in enumerate(regions) if (key := opposite(region.name))}
@@ -185,7 +220,10 @@ class Measurer:
         if isinstance(p, Spot) and isinstance(q, Spot):
             line = self.body.path(np.array(p.point_m), np.array(q.point_m))
             distance = NAN if line is None else along(line)[-1] * 1e3
-        return Difference(a.name, b.name, a.value_degC - b.value_degC, sigma, distance)
+        budget = None
+        if a.errors is not None and b.errors is not None and np.isfinite(a.sigma_K + b.sigma_K):
+            budget = of_difference(f"{a.name} - {b.name}", a.errors, b.errors, self.inputs)
+        return Difference(a.name, b.name, a.value_degC - b.value_degC, sigma, distance, budget)
 
     def _spot(self, region: Spot) -> Reading:
         _, corners, weights = self.body.nearest(np.array([region.point_m]))

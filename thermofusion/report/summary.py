@@ -288,6 +288,7 @@ def _temperature(t: Temperature) -> dict[str, Any]:
         "level_sigma_K": t.level_sigma_K,
         "flags": flags,
         "crosscal": t.crosscal,
+        "inputs": [vars(i) for i in t.inputs],
         "room": {} if t.room is None else t.room.told(),
         "criticism": {} if t.calibration is None else t.calibration.criticism,
     }

@@ -78,7 +78,9 @@ class Result(Steps):
 
     def measure(self, *regions: Region) -> Measured:
         """What regions of interest read, left against right (docs/report.md). Raises RecipeError as `mesh`."""
-        return Measured.of(Measurer(self.mesh, None if self.temperature is None else self.temperature.shared), regions)
+        found = self.temperature
+        known = () if found is None else (found.shared, found.inputs)
+        return Measured.of(Measurer(self.mesh, *known), regions)
 
     def _repr_html_(self) -> str:
         """The report, small, for notebooks."""

@@ -41,6 +41,7 @@ def _shape() -> dict[str, type]:
 def _of_types() -> dict[str, type]:
     """Nouns that several rooms share."""
     from ..types import (
+        BudgetInput,
         Camera,
         LensScatter,
         Observations,
@@ -54,6 +55,7 @@ def _of_types() -> dict[str, type]:
     )
 
     return {
+        "budget-input/1": BudgetInput,
         "camera/1": Camera,
         "lens-scatter/1": LensScatter,
         "observations/1": Observations,
@@ -102,7 +104,8 @@ def stored() -> MappingProxyType[str, type]:
             "rig/1": RigResult,
             "room-map/1": RoomMap,
             "sensor-pattern/1": Pattern,
-            "temperature/3": Temperature,
+            "temperature/4": Temperature,
+            "temperature/3": Temperature,  # without `inputs`
             "temperature/2": Temperature,  # without `room`
             "temperature/1": Temperature,  # without `shared`
             "tracking/1": TrackingResult,

@@ -15,7 +15,7 @@ from ..physics.band import Band
 from ..physics.emissivity import EmissivityModel, model_from_recipe
 from ..physics.equation import leaving_radiance
 from ..recipe import MappingSection, TemperatureSection
-from ..types import Bool, Camera, Float, Float32, Int, Observations, Scan, SurfaceMesh, ThermalViews
+from ..types import Bool, Camera, Float, Float32, Int, LensScatter, Observations, Scan, SurfaceMesh, ThermalViews
 from .references import ContactReading, ExpectedReading, contact_readings, expected_readings
 from .room.harmonics import open_transfer
 from .room.map import RoomMap, RoomPrior
@@ -40,8 +40,8 @@ class ThermalProblem:
     vertices are a sample. errors : one-sigma parts of an observation. blackbodies, contacts : what sets the level.
     vertices_per_patch : vertices that share a normal's error. other : (V,) what is not skin, None = not asked.
     room_map : radiance of the room from each direction; None: even, as stated. transfer : (V, 9) how its harmonics
-    light a vertex. uneven : (V,) what the room adds to what vertices reflect, beyond its mean. effects : (V,)
-    what one sigma of the lens's scatter, or of who stands at the camera, does to readings of a vertex.
+    light a vertex. uneven : (V,) what the room adds to what vertices reflect, beyond its mean. scatter : of the
+    lens. effects : (V,) what one sigma of it, or of who stands at the camera, does to readings of a vertex.
     """
 
     vertices: NDArray[np.intp]
@@ -68,6 +68,7 @@ class ThermalProblem:
     room_map: RoomMap | None = None
     transfer: Float32 | None = None
     uneven: Float | None = None
+    scatter: LensScatter | None = None
     effects: Mapping[str, Float32] = field(default_factory=dict)
 
     @classmethod
@@ -120,6 +121,7 @@ class ThermalProblem:
             vertices_per_patch=vertices_per_patch(surface, normal_window_m),
             mapping=mapping,
             settings=settings,
+            scatter=mapped.scatter,
             effects={"operator": held} | ({} if mapped.scattered is None else {"scatter": mapped.scattered}),
             room_map=RoomMap.unseen(_room_prior(room, settings, band)),
             transfer=open_transfer(surface.normals).astype(np.float32) if around is None else around.transfer,

@@ -17,9 +17,21 @@ from ..mapping.observe import Mapped
 from ..physics.band import ZERO_DEGC_K
 from ..progress import Progress, silent
 from ..recipe import MappingSection, TemperatureSection
-from ..types import Bool, Float32, OutputMode, Scan, SharedErrors, SurfaceMesh, ThermalMesh, VertexFlag, brief
+from ..types import (
+    Bool,
+    BudgetInput,
+    Float32,
+    OutputMode,
+    Scan,
+    SharedErrors,
+    SurfaceMesh,
+    ThermalMesh,
+    VertexFlag,
+    brief,
+)
 from .blend import BlendResult, blend
 from .crosscal import Calibration, Overlap
+from .inputs import inputs_of
 from .problem import ThermalProblem
 from .room.map import RoomMap
 from .room.stated import Room
@@ -43,7 +55,7 @@ class Temperature:
     body_fraction : (V,) F, or None. level_sigma_K : one sigma of the level common to all vertices, by part; a single
     vertex's absolute interval is √(uncertainty² + Σ level²). crosscal : for the report; methods : of old results.
     shared : what errors of vertices have in common; None where nothing tells (version 0.1.0 wrote the result, say).
-    room : its radiance by direction, as it was used.
+    room : its radiance by direction, as it was used. inputs : what the temperatures depend on, for budgets.
     """
 
     mesh: ThermalMesh
@@ -58,6 +70,7 @@ class Temperature:
     messages: tuple[str, ...] = ()
     shared: SharedErrors | None = None
     room: RoomMap | None = None
+    inputs: tuple[BudgetInput, ...] = ()
 
     __repr__ = brief
 
@@ -120,6 +133,7 @@ def solve(
         messages=(*problem.room.assumed, *notes),
         shared=_shared(result, problem.lens.focal_px, normal_window_m),
         room=problem.room_map,
+        inputs=inputs_of(problem, calibration),
     )
 
 

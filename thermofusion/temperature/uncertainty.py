@@ -22,6 +22,7 @@ DEFAULT_PSF_PX = 0.7  # point spread of a microbolometer camera in focus, where 
 EDGE_MARGIN_PX = 0.5  # fused surfaces shrink or swell by about this much of a thermal pixel
 BILINEAR_VARIANCE = 4 / 9  # mean over sub-pixel positions of the noise variance left by bilinear sampling
 AIR_LOSS_PER_M = 0.006  # 1-τ of a metre of room air at 50 % humidity, 7.5-13.5 µm (62 mK at 10 K contrast)
+PATH_M = 0.5  # by which a reference may stand nearer or farther than the subject: so much air is not known
 LINKED_EPSILON0_SIGMA = 0.005  # of ε(0) of skin in the literature, also where it follows the fitted shape
 ALONG_SURFACE = 2**-0.5  # share of a shift away from the body's middle that runs along its surface
 MAX_LEVER = 4.0  # bound on a normal error's lever near grazing, where the linear form no longer holds
@@ -168,6 +169,7 @@ class Uncertainty:
         do beyond their common shift. gain : likewise. scale : of the depth, on a gradient. pattern : what
         residuals still have in common by place in the image. views : how far views disagree, for methods that do
         not calibrate them.
+        path : of air between subject and camera, more or less than the reference's. operator : who holds the camera.
         scatter : of the lens's scatter that was taken off, or could be there.
         not_skin : emissivity of what is flagged as not skin.
     level_parts_K : reference, emissivity0, reflected: one number each. A relative result has no reference: its level is
@@ -308,6 +310,8 @@ def vertex_uncertainty(
         "reference": zero + np.nan_to_num(b.level_sigma_K) / b.divisor,
         "emissivity0": scale * x / b.epsilon0 * sigma_epsilon0 if b.absolute else zero,
     }
+    if b.air_K is not None:
+        common["path"] = air_loss * PATH_M * (T_K - b.air_K)
     for i, lit in enumerate(levers.room.T, 1):
         common[f"reflected {i}" if levers.room.shape[1] > 1 else "reflected"] = reflected * lit / b.slope_L
     if b.gain_pivot_K is not None:
