@@ -96,7 +96,9 @@ def load(folder: Path, seconds: float) -> None:
         if (folder / "out" / "recording.mcap").exists():
             rows.append((time.monotonic(), *used(process.pid)))
     answer = json.loads(process.communicate()[0])
-    steady = [r for r in rows if rows[0][0] + 5 < r[0] < rows[-1][0] - 2]  # rings have gone round once
+    steady = [
+        r for r in rows if rows[0][0] + 12 < r[0] < rows[-1][0] - 6
+    ]  # rings have gone round once, no process ends
     cores = (steady[-1][1] - steady[0][1]) / (steady[-1][0] - steady[0][0])
     memory = [r[2] for r in steady]
     print(json.dumps({"streams": answer["streams"], "problems": answer["problems"]}))
