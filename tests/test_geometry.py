@@ -134,3 +134,24 @@ def test_viewing_angle_is_to_the_eye_not_to_the_axis():
 def test_what_is_no_rigid_transform_is_named(T, word):
     with pytest.raises(ValueError, match=word):
         check_rigid(T, "T_thermal_depth")
+
+
+def test_gradient_of_a_plane_and_of_noise():
+    """A plane in a field of 10 K/m, seen as its rms over directions; noise of single vertices is hardly one."""
+    from thermofusion.geometry.mesh import edge_gradient
+
+    n = 40
+    y, x = np.mgrid[0:n, 0:n].reshape(2, -1) * 3e-3
+    vertices = np.column_stack([x, y, 0 * x]).astype(np.float32)
+    i = np.arange(n * n).reshape(n, n)
+    a, b, c, d = (q.ravel() for q in (i[:-1, :-1], i[:-1, 1:], i[1:, 1:], i[1:, :-1]))
+    triangles = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(np.int32)
+    inner = i[3:-3, 3:-3].ravel()
+    angle = np.radians(22.5)  # no edge of this mesh is preferred
+    slope = edge_gradient(vertices, triangles, 10 * (np.cos(angle) * x - np.sin(angle) * y))
+    np.testing.assert_allclose(slope[inner], slope[inner][0], rtol=1e-3)
+    assert 7 < slope[inner][0] < 13
+    noise = 0.01 * np.random.default_rng(2).normal(size=n * n)
+    assert np.median(edge_gradient(vertices, triangles, noise)[inner]) < 0.3 * np.sqrt(2) * 0.01 / 3e-3
+    holed = np.where(x > 0.06, np.nan, 10 * x)
+    assert np.isfinite(edge_gradient(vertices, triangles, holed)).all()

@@ -176,15 +176,22 @@ def _average(triangles: Int, count: int, self_weight: float) -> csr_matrix:
 def edge_gradient(vertices: Float32, triangles: Int, values: NDArray) -> Float32:
     """Magnitude of the gradient of values (V,) along a surface of vertices (V, 3) m, per metre; 0 where unmeasured.
 
-    Root mean square over a vertex's edges of the directional derivative, times √2 (an edge's direction is random).
+    Squared differences along a vertex's edges over their squared lengths, sum over sum, times 2 (an edge's direction is
+    random). Values are averaged with their neighbours' first: noise of single vertices is no gradient, least of all
+    along the slivers that marching cubes leave.
     """
     a = np.concatenate([triangles[:, 0], triangles[:, 1], triangles[:, 2]])
     b = np.concatenate([triangles[:, 1], triangles[:, 2], triangles[:, 0]])
-    length2 = ((vertices[a] - vertices[b]) ** 2).sum(1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        slope2 = (values[a] - values[b]) ** 2 / length2
-    good = np.isfinite(slope2)
-    n = len(vertices)
-    total = np.bincount(a[good], slope2[good], n) + np.bincount(b[good], slope2[good], n)
-    count = np.bincount(a[good], minlength=n) + np.bincount(b[good], minlength=n)
-    return np.sqrt(2 * total / np.maximum(count, 1)).astype(np.float32)
+    n, known = len(vertices), np.isfinite(values)
+
+    def around(of_a: NDArray, of_b: NDArray) -> Float:
+        """Per vertex the sum over its edges of what each end gets."""
+        return np.bincount(a, of_a, n) + np.bincount(b, of_b, n)
+
+    filled, one = np.where(known, values, 0.0), known.astype(np.float64)
+    mean = (2 * filled + around(filled[b], filled[a])) / np.maximum(2 * one + around(one[b], one[a]), 1)
+    both = known[a] & known[b]
+    square = np.where(both, (mean[a] - mean[b]) ** 2, 0.0)
+    length2 = np.where(both, ((vertices[a] - vertices[b]) ** 2).sum(1), 0.0)
+    total, reach = around(square, square), around(length2, length2)
+    return np.sqrt(2 * total / np.where(reach > 0, reach, np.inf)).astype(np.float32)

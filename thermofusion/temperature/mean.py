@@ -15,7 +15,6 @@ from ..types import Float, Float32, Int
 L1_STEPS, TUKEY_STEPS = 4, 3
 SCALE_ROWS = 200_000  # enough for a robust scale
 L1_FLOOR = 0.3  # of one sigma: below it the L1 start is quadratic
-MAX_SHARE = 0.8  # of a row in its own mean, beyond which its left-out residual says nothing more
 LEAST_WEIGHT = 0.02  # share of a vertex's weight that must survive Tukey's
 
 
@@ -125,20 +124,20 @@ class RobustMean:
         return sigmas, np.sqrt(spread * n / freedom)
 
     def own_variance(self, solved: Solved, block: Int) -> Float:
-        """Variance of x per group (G,) as its own rows say: (Σ h d)² over blocks of rows that may share an error.
+        """Variance of x per group (G,) as its own rows say: (Σ h r)² over blocks of rows that may share an error.
 
-        d : left-out residuals; block : (N,) number of each row's, not falling within a group. A sandwich estimate; NaN
-        where a group has one block.
+        r : residuals; block : (N,) number of each row's, not falling within a group. A sandwich estimate; its n/(n-1)
+        blocks make up for what a block takes of its own mean. NaN where a group has one block.
         """
         if not len(self.groups):
             return np.zeros(0)
         h = solved.weight * self.E / self.groups.rows(self.denominator(solved.weight))
-        d = self.residual(solved.x) / (1 - np.minimum(h * self.E, MAX_SHARE))
+        r = self.residual(solved.x)
         new = np.ones(len(block), bool)
         new[1:] = block[1:] != block[:-1]
         new[self.groups.start] = True
         starts = np.flatnonzero(new)
-        sums = np.add.reduceat(h * d, starts, dtype=np.float64) ** 2
+        sums = np.add.reduceat(h * r, starts, dtype=np.float64) ** 2
         first = np.searchsorted(starts, self.groups.start)
         n = np.diff(np.append(first, len(starts)))
         total = np.add.reduceat(sums, first)

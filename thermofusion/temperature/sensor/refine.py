@@ -27,7 +27,7 @@ MIN_Z = 5.0
 # Amplitude of a pattern over the agreement that vertices' means leave of it.
 DRIFT_OVER_SIZE, FIXED_OVER_SIZE = 6.0, 3.0
 LEFT_OVER_SIZE = 2.0  # error of a vertex over the agreement that is left
-JUMP_SIGMAS = 5.0  # a step of the offsets between views beyond this many of their usual steps is a shutter's
+JUMP_SIGMAS = 4.0  # a step of the offsets between views beyond this many of their usual steps is a shutter's; one too many costs little
 MIN_STRETCH_VIEWS = 4
 FOLDS = 3
 SOLVE_STEPS = 6  # of reweighting: from the solution without a pattern
@@ -56,6 +56,11 @@ class Refinement:
     def left_K(self) -> float:
         """One sigma of what residuals still have in common by place in the image, where that is beyond chance."""
         return LEFT_OVER_SIZE * max(a.size_K if _beyond_chance(a, self.floor_K) else 0.0 for a in self.after.values())
+
+    @property
+    def hidden_K(self) -> float:
+        """One sigma of a pattern that residuals hide or no term explains: any up to the floor may be there."""
+        return max(FIXED_OVER_SIZE * self.floor_K / np.sqrt(3), self.left_K)
 
 
 def refine(problem: ThermalProblem, system: OverlapSystem, solution: Solution, rows: Observations) -> Refinement:
