@@ -12,7 +12,7 @@ from support.synthetic_views import BAND, WIDTH, make_world
 from thermofusion.mapping.pixels import bad_pixels
 from thermofusion.physics.signal import SignalConverter
 from thermofusion.scans.check import _automatic_gain
-from thermofusion.temperature import crosscal
+from thermofusion.temperature import clusters, crosscal
 from thermofusion.temperature.sensor.pattern import Pattern
 from thermofusion.types import Camera, ThermalCamera, ThermalStream
 
@@ -107,3 +107,20 @@ def test_pictures_stretched_anew_in_every_frame_are_refused_and_eight_bits_alone
     assert _automatic_gain(stretched)
     moving = [np.round(s * (40 + k) + 7 * k).astype(np.uint16) for k, s in enumerate(stretched)]
     assert _automatic_gain(moving)
+
+
+def test_what_errors_of_a_cell_do_to_the_calibration():
+    """The shift that is predicted for an error common to one cell of the image is the one that solving again gives."""
+    world = make_world(3, n_views=12)
+    problem = problem_of(world.observations, world.n_vertices, world.n_views, errors=errors(netd_K=0.05))
+    overlap = crosscal.Overlap.of(problem)
+    system, solution, rows = overlap.system, overlap.solution, overlap.rows
+    cell = (rows.u_px > WIDTH / 2).astype(np.int64)
+    error = np.full(len(rows), 0.02 * SLOPE)
+    start = system.step(solution.p, solution.x, solution.weight)[0]
+    moved = replace(system, y=system.y + np.where(cell == 1, error, 0))
+    expected = moved.step(solution.p, solution.x, solution.weight)[0] - start
+    found = clusters._Scores(system, solution).shifts(error, cell)[1]
+    np.testing.assert_allclose(found, expected, atol=0.02 * np.abs(expected).max())
+    wider = clusters.with_clusters(system, solution, rows, WIDTH, 0.01)
+    assert (np.diag(wider.covariance) >= np.diag(solution.covariance) * (1 - 1e-9)).all()

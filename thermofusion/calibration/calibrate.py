@@ -44,6 +44,10 @@ class Calibrated:
     found: dict[str, int] = field(default_factory=dict)
     advice: tuple[str, ...] = ()
 
+    def has_picture(self, camera: str, name: str) -> bool:
+        """False for a view of picks whose picture is not in the folder."""
+        return name in self.folder.files.get("infrared" if camera == "depth" else camera, {})
+
     def picture(self, camera: str, name: str) -> UInt8:
         """(H, W, 3) RGB: the view's picture with accepted points as green rings, rejected ones as red crosses."""
         image = getattr(self.folder, "infrared" if camera == "depth" else camera)(name)

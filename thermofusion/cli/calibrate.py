@@ -65,7 +65,8 @@ def calibrate(
     if radiometry is not None:
         document["radiometry"] = {k: getattr(radiometry, k) for k in ("counts_range", "residual_K", "sigma_K")}
     write_rig(out, document)
-    names = [(c, v.name) for v in done.calibration.data.views for c in v.points][:PICTURES_IN_REPORT]
+    views = [(c, v.name) for v in done.calibration.data.views for c in v.points]
+    names = [view for view in views if done.has_picture(*view)][:PICTURES_IN_REPORT]
     pictures = {f"{camera} {name}": done.picture(camera, name) for camera, name in names}
     page = report or out.with_suffix(".html")
     write_text(page, report_html(done.calibration, advice=done.advice, pictures=pictures))

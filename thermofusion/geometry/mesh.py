@@ -186,7 +186,7 @@ def edge_gradient(vertices: Float32, triangles: Int, values: NDArray) -> Float32
 
     def around(of_a: NDArray, of_b: NDArray) -> Float:
         """Per vertex the sum over its edges of what each end gets."""
-        return np.bincount(a, of_a, n) + np.bincount(b, of_b, n)
+        return np.asarray(np.bincount(a, of_a, n) + np.bincount(b, of_b, n), np.float64)
 
     filled, one = np.where(known, values, 0.0), known.astype(np.float64)
     mean = (2 * filled + around(filled[b], filled[a])) / np.maximum(2 * one + around(one[b], one[a]), 1)

@@ -23,7 +23,6 @@ from .crosscal import Calibration
 from .mean import Groups, RobustMean, Solved
 from .problem import ThermalProblem
 from .room.stated import Room
-from .sensor.criticism import patches
 from .uncertainty import (
     AngleTables,
     Budget,
@@ -41,6 +40,7 @@ THREADS = 2
 BLOCK = 1_500_000  # rows worked on at once by each thread: bounds memory whatever the scan
 BLOCK_VIEWS = 5  # following each other: what they err in common is one error
 PATCH_M = 0.05  # of skin, over which vertices' own scatter is averaged: one vertex has too few views for it
+MAX_CELLS = 200  # of the grid along its longest side
 OTHER_EPSILON_SIGMA = 0.1  # of the emissivity of what is not skin: cloth and hair reach from 0.75 to 0.98
 MODES = 10  # of the calibration's covariance that are followed to each vertex
 FACING_DEG = 15.0  # what counts as straight on for the paper's S
@@ -293,11 +293,32 @@ def _gain_pivot_K(problem: ThermalProblem, calibration: Calibration | None) -> f
 
 
 def _own_noise(noise_K: Float32, normals_K: Float32, own_K2: Float32, points_m: Float32) -> Float32:
-    """Noise (V,) K at points_m (V, 3), or what rows of their patch say, own_K2 (V,) K², beyond normals_K (V,) K."""
-    number, _ = patches(points_m, PATCH_M)
-    known = np.isfinite(own_K2)
-    mean = np.bincount(number, np.where(known, own_K2, 0)) / np.maximum(np.bincount(number, known), 1)
-    return np.sqrt(np.maximum(noise_K**2, mean[number] - normals_K**2)).astype(np.float32)
+    """Noise (V,) K at points_m (V, 3), or what rows around say, own_K2 (V,) K², beyond normals_K (V,) K."""
+    return np.sqrt(np.maximum(noise_K**2, _around(own_K2, points_m, PATCH_M) - normals_K**2)).astype(np.float32)
+
+
+def _around(values: NDArray, points_m: NDArray, size_m: float) -> Float:
+    """Mean of values (V,) about each of points_m (V, 3), over cells of size_m that blend into each other; NaN = none.
+
+    Values are shared out to the eight nodes of a grid around a point, and read from there again.
+    """
+    low = points_m.min(axis=0, initial=np.inf)
+    size_m = max(size_m, float(np.ptp(points_m, axis=0).max(initial=0)) / MAX_CELLS)
+    at = (points_m - low) / size_m
+    corner = np.floor(at).astype(np.int64)
+    share, shape = at - corner, corner.max(axis=0, initial=0) + 2
+    known = np.isfinite(values)
+    filled, sums, weights = np.where(known, values, 0.0), np.zeros(shape.prod()), np.zeros(shape.prod())
+    nodes = []
+    for step in np.ndindex(2, 2, 2):
+        weight = np.prod(np.where(step, share, 1 - share), axis=1)
+        node = np.ravel_multi_index((corner + step).T, shape)
+        sums += np.bincount(node, weight * filled, len(sums))
+        weights += np.bincount(node, weight * known, len(sums))
+        nodes.append((node, weight))
+    total = sum(weight * sums[node] for node, weight in nodes)
+    seen = sum(weight * weights[node] for node, weight in nodes)
+    return np.divide(total, seen, out=np.full(len(values), np.nan), where=seen > 0)
 
 
 # ---------------------------------------------------------------- which observations count

@@ -27,8 +27,11 @@ MAX_SHARE = 0.5  # of the body: beyond it the model of skin is at fault
 BORDER_K = 0.5  # a border is drawn by temperature where both sides differ by this much
 
 
-def not_skin(problem: ThermalProblem, calibration: Calibration, blended: BlendResult) -> Bool:
-    """(V,) True where the surface does not behave as skin. Says nothing where fewer than eight views saw a patch."""
+def not_skin(problem: ThermalProblem, calibration: Calibration, blended: BlendResult) -> tuple[Bool, float]:
+    """(V,) True where the surface does not behave as skin. Says nothing where fewer than eight views saw a patch.
+
+    Where that would be more than half of the surface the model of skin is at fault: nothing, and the share it would be.
+    """
     patch_of, _ = patches(problem.points_m, PATCH_M)
     n = int(patch_of.max(initial=0)) + 1
     z = _slopes(problem, calibration, blended, patch_of, n)
@@ -44,9 +47,10 @@ def not_skin(problem: ThermalProblem, calibration: Calibration, blended: BlendRe
     # surrounded by it: too few views, but no island of skin
     neighbours = np.maximum(near @ np.ones(n), 1)
     found |= near @ found.astype(float) > 0.6 * neighbours
-    if not found.any() or found[patch_of].mean() > MAX_SHARE:
-        return np.zeros(len(problem), bool)
-    return _bordered(problem.points_m, blended.normal_equivalent_K, patch_of, found, middle)
+    share = float(found[patch_of].mean()) if found.any() else 0.0
+    if share == 0 or share > MAX_SHARE:
+        return np.zeros(len(problem), bool), share
+    return _bordered(problem.points_m, blended.normal_equivalent_K, patch_of, found, middle), 0.0
 
 
 def _slopes(

@@ -42,6 +42,7 @@ from .skin import not_skin
 Sections = tuple[MappingSection, TemperatureSection]
 METHODS = ("nearest-view", "mean", "cos-resolution", "paper", "corrected-cos", "joint")
 CAVITY_FRACTION = 0.2  # of the hemisphere: beyond it reflection between body parts exceeds 0.1 K
+CAVITY_K = 0.05  # that reflection adds at least: things as warm as the room add nothing
 HIGH_RESIDUAL = 3.0  # views disagree by more than this many of their own sigmas: hair, clothes, motion
 ANGLE_ROWS, ANGLE_STEP_DEG, ANGLE_LEAST = 200_000, 5.0, 200  # of the plot over the angle: rows, bins, rows of a bin
 UNCERTAINTY_MEANS = "one sigma about the level common to all vertices; _absolute, where the level is known: with it"
@@ -122,7 +123,7 @@ def solve(
     progress("temperature", 4, 4)
     body_fraction = None if problem.around is None else problem.around.body_fraction
     return Temperature(
-        mesh=_flagged(_mesh(mesh, result, calibration, body_fraction, problem.room, other), mapped.unsettled),
+        mesh=_flagged(_mesh(mesh, result, calibration, _cavity(problem), problem.room, other), mapped.unsettled),
         absolute_degC=_degC(result.absolute_K),
         normal_equivalent_degC=_degC(result.normal_equivalent_K),
         apparent_degC=_degC(result.apparent_K),
@@ -166,14 +167,18 @@ def calibrated(
         overlap = overlap.lit_again(problem)
         plain = overlap.plain()
     first = blend(problem, plain, with_uncertainty=False)
-    other = not_skin(problem, plain, first)
+    other, doubted = not_skin(problem, plain, first)
     if other.any():
         problem = problem.without(other)
         overlap = Overlap.of(problem)
     calibration = overlap.refined()
     if other.any() or calibration.sensor is not None:  # else the plain one says the same
         first = blend(problem, calibration, with_uncertainty=False)
-    return problem, calibration, calibration.messages, other, first
+    doubts: tuple[str, ...] = ()
+    if doubted:
+        text = f"{doubted:.0%} of the surface do not behave as skin: none is flagged, the model of ε(θ) may be wrong"
+        doubts = (text,)
+    return problem, calibration, (*calibration.messages, *doubts), other, first
 
 
 def unmeasured(surface: SurfaceMesh, temperature: TemperatureSection) -> Temperature:
@@ -187,11 +192,21 @@ def unmeasured(surface: SurfaceMesh, temperature: TemperatureSection) -> Tempera
 # ---------------------------------------------------------------- parts
 
 
+def _cavity(problem: ThermalProblem) -> Bool:
+    """(V,) True where much of what is reflected is the body's own, and unlike the room by enough to be read."""
+    if problem.around is None:
+        return np.zeros(len(problem), bool)
+    L_room = float(problem.band.radiance(problem.room.reflected_K))
+    slope = float(problem.band.d_radiance_dT(problem.room.reflected_K))
+    added_K = (1 - problem.emissivity.hemispherical) * np.abs(problem.L_reflected - L_room) / slope
+    return np.asarray((problem.around.body_fraction > CAVITY_FRACTION) & (added_K > CAVITY_K))
+
+
 def _mesh(
     surface: SurfaceMesh,
     result: BlendResult,
     calibration: Calibration | None,
-    body_fraction: Float32 | None,
+    cavity: Bool,
     room: Room,
     other: Bool,
 ) -> ThermalMesh:
@@ -200,8 +215,7 @@ def _mesh(
     flags[result.count == 1] |= np.uint8(VertexFlag.SINGLE_VIEW)
     flags[result.oblique] |= np.uint8(VertexFlag.OBLIQUE)
     flags[np.nan_to_num(result.residual) > HIGH_RESIDUAL] |= np.uint8(VertexFlag.HIGH_RESIDUAL)
-    if body_fraction is not None:
-        flags[body_fraction > CAVITY_FRACTION] |= np.uint8(VertexFlag.CAVITY)
+    flags[cavity] |= np.uint8(VertexFlag.CAVITY)
     anchored = calibration is not None and calibration.anchored
     parts = dict(result.uncertainty.parts_K)
     if anchored:

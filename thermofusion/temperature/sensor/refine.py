@@ -27,7 +27,7 @@ MIN_Z = 5.0
 # Amplitude of a pattern over the agreement that vertices' means leave of it.
 DRIFT_OVER_SIZE, FIXED_OVER_SIZE = 6.0, 3.0
 LEFT_OVER_SIZE = 2.0  # error of a vertex over the agreement that is left
-JUMP_SIGMAS = 4.0  # a step of the offsets between views beyond this many of their usual steps is a shutter's; one too many costs little
+JUMP_SIGMAS = 4.0  # a step of the offsets between views beyond this many of their usual ones is a shutter's
 MIN_STRETCH_VIEWS = 4
 FOLDS = 3
 SOLVE_STEPS = 6  # of reweighting: from the solution without a pattern
