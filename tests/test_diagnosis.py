@@ -12,7 +12,7 @@ from support.synthetic_views import BAND, WIDTH, make_world
 from thermofusion.mapping.pixels import bad_pixels
 from thermofusion.physics.signal import SignalConverter
 from thermofusion.scans.check import _automatic_gain
-from thermofusion.temperature import clusters, crosscal
+from thermofusion.temperature import crosscal, hidden
 from thermofusion.temperature.sensor.pattern import Pattern
 from thermofusion.types import Camera, ThermalCamera, ThermalStream
 
@@ -120,7 +120,7 @@ def test_what_errors_of_a_cell_do_to_the_calibration():
     start = system.step(solution.p, solution.x, solution.weight)[0]
     moved = replace(system, y=system.y + np.where(cell == 1, error, 0))
     expected = moved.step(solution.p, solution.x, solution.weight)[0] - start
-    found = clusters._Scores(system, solution).shifts(error, cell)[1]
+    found = hidden._Scores(system, solution).shifts(error, cell)[1]
     np.testing.assert_allclose(found, expected, atol=0.02 * np.abs(expected).max())
-    wider = clusters.with_clusters(system, solution, rows, WIDTH, 0.01)
+    wider = hidden.with_pattern(system, solution, rows, WIDTH, 0.01)
     assert (np.diag(wider.covariance) >= np.diag(solution.covariance) * (1 - 1e-9)).all()

@@ -28,7 +28,7 @@ from ..physics.emissivity import AngleTable, EmissivityModel, reshaped, shape_di
 from ..physics.equation import without_gain
 from ..robust import MAD_PER_SIGMA, NORMAL_95
 from ..types import Bool, Float, Float32, Observations, brief
-from .clusters import with_clusters
+from .hidden import with_pattern
 from .layout import Layout
 from .problem import ThermalProblem
 from .references import ContactReading, ExpectedReading
@@ -353,8 +353,8 @@ def _shape_bias(emissivity: EmissivityModel, sigma_normal_deg: float) -> float:
 def _result(overlap: Overlap, refinement: Refinement | None) -> Calibration:
     """The solution in terms of views and the whole field."""
     problem, system, solution, rows, held = vars(overlap).values()
-    if refinement is not None:
-        solution = with_clusters(system, solution, rows, problem.lens.width_px, refinement.hidden_K)
+    if refinement is not None and problem.settings.crosscal.vignetting:
+        solution = with_pattern(system, solution, rows, problem.lens.width_px, refinement.hidden_K)
     at, n, slope = system.layout, problem.n_views, system.slope_L
     group = np.arange(n) if problem.settings.crosscal.offsets else np.zeros(n, np.intp)
     shape_bias = _shape_bias(problem.emissivity, problem.errors.sigma_normal_deg)
