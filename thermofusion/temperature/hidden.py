@@ -1,5 +1,7 @@
-"""What a pattern of the sensor that residuals hide does to the calibration: a part of the covariance that noise does not
-know. It is one error in all readings of a cell of the image, whatever their number.
+"""What a pattern of the sensor that residuals hide does to the calibration.
+
+It is one error in all readings of a cell of the image, whatever their number: noise does not know this part of the
+covariance.
 """
 
 from __future__ import annotations
