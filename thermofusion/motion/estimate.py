@@ -34,7 +34,7 @@ SMEARED_M = ((0.06, 0.02), (0.06, 0.015), (0.06, 0.01), (0.05, 0.007))
 SHARP_M = ((0.05, 0.007), (0.04, 0.005), (0.03, 0.004))
 LEFT_OUT = 4  # every fourth frame judges
 STILL = 0.5  # `unrest` below it: noise
-MIN_GAIN = 0.05  # share by which the left-out residual must fall
+MIN_GAIN = 0.02  # share by which the left-out residual must fall: of all points, most of which hardly move
 MIN_FRAMES, MIN_VERTICES = 30, 1000
 MAX_SHIFT_M = 0.01  # of a point along its normal, at once
 

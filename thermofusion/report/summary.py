@@ -212,7 +212,12 @@ def _motion(m: BodyMotion | None) -> dict[str, Any]:
 
 
 def _motion_line(m: Mapping[str, Any]) -> str:
-    """The parts that moved most, in words."""
+    """The parts that moved most, in words; of a subject that is not seen whole, how much its surface moved."""
+    if len(m["parts"]) < MOST_MOVED:
+        return (
+            f"the subject moved against its trunk and was brought to rest: half of it by {m['median_mm']:.1f} mm, "
+            f"a twentieth by more than {m['p95_mm']:.1f} mm (rms)"
+        )
     most = sorted(m["parts"], key=lambda p: -p["rms_mm"])[:MOST_MOVED]
     parts = ", ".join(f"{p['name']} {p['rms_mm']:.0f} mm" for p in most)
     return f"the subject moved against its trunk and was brought to rest: {parts} (rms)"
