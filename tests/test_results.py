@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import resource
+import stat
 import zipfile
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -150,6 +152,12 @@ def test_files_appear_whole_or_not_at_all(tmp_path):
     assert [p.name for p in path.parent.iterdir()] == ["out.txt"]
     with pytest.raises(ResourceError, match="cannot be written"), replacing(path):
         raise OSError(28, "No space left on device")
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to("pipe")
+    for name in ("pipe", "link", "x"):  # a device is never replaced by a file
+        with pytest.raises(ResourceError, match="stands where"):
+            write_text(tmp_path / name, "thermofusion")
+    assert stat.S_ISFIFO((tmp_path / "pipe").stat().st_mode)
 
 
 A, B = Stage("a", ("input",)), Stage("b", ("input", "mapping"))

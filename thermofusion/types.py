@@ -43,6 +43,9 @@ def brief(noun: object) -> str:
     return f"{type(noun).__name__}({said if len(said) <= 160 else said[:157] + '...'})"
 
 
+ORTHONORMAL = 1e-14  # rounding: what is a rotation to this stays as it is, so that it may be stored and read again
+
+
 def check_rigid(T: object, name: str) -> Float:
     """A rigid transform (4, 4) [m] as float64, rotation re-orthonormalised. Raises ValueError naming `name`."""
     M = np.asarray(T, dtype=np.float64)
@@ -55,9 +58,11 @@ def check_rigid(T: object, name: str) -> Float:
         raise ValueError(f"{name} is no rigid transform: its 3x3 part is not a rotation")
     if np.abs(M[3] - [0, 0, 0, 1]).max() > 1e-9:
         raise ValueError(f"{name} must have the last row 0 0 0 1")
-    U, _, Vt = np.linalg.svd(R)
     out = np.eye(4)
-    out[:3, :3], out[:3, 3] = U @ Vt, M[:3, 3]
+    out[:3, :3], out[:3, 3] = R, M[:3, 3]
+    if np.abs(R.T @ R - np.eye(3)).max() > ORTHONORMAL:
+        U, _, Vt = np.linalg.svd(R)
+        out[:3, :3] = U @ Vt
     return out
 
 
@@ -297,8 +302,8 @@ class Trajectory:
             raise ValueError("the trajectory has a pose that is not finite")
         if len(t) > 1 and not (np.diff(t) > 0).all():
             raise ValueError("the trajectory's times run backwards or repeat")
-        object.__setattr__(self, "times_s", t)
-        object.__setattr__(self, "T_world_depth", T)
+        object.__setattr__(self, "times_s", np.ascontiguousarray(t))  # sums depend on how numbers lie in memory,
+        object.__setattr__(self, "T_world_depth", np.ascontiguousarray(T))  # and stored ones lie like this
 
     def __len__(self) -> int:
         return len(self.times_s)

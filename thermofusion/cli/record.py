@@ -143,7 +143,7 @@ def _opened(sources: Sources, room: Room) -> tuple[list[Callable[[], Device]], d
 def _keys(waits: bool) -> Iterator[Callable[[], str | None]]:
     """A control by single keys, where there is a keyboard."""
     words = {"q": "stop", "c": "shutter", " ": "start"}
-    if sys.stdin is None or not sys.stdin.isatty():
+    if sys.platform == "win32" or sys.stdin is None or not sys.stdin.isatty():
         if waits:
             raise RecipeError("--wait needs a keyboard, and there is none here")
         yield lambda: None

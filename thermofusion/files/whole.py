@@ -6,6 +6,7 @@ import errno
 import os
 import re
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -34,8 +35,7 @@ def replacing(path: str | Path, *, whatever: bool = False) -> Iterator[Path]:
     refuses.
     """
     path = Path(path)
-    if path.is_dir():
-        raise ResourceError("a folder stands where a file is to be written", place=path, hint="name a file")
+    _free(path)
     if not whatever:
         spared(path)
     with _refusals(path):
@@ -49,6 +49,17 @@ def replacing(path: str | Path, *, whatever: bool = False) -> Iterator[Path]:
             _to_disk(path.parent)
         finally:
             temporary.unlink(missing_ok=True)
+
+
+def _free(path: Path) -> None:
+    """Raises ResourceError where a folder, a device or a pipe has the name: a rename would put a file in its place."""
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError):
+        return  # absent, or whoever writes will say what is the matter
+    if not stat.S_ISREG(mode):
+        what = "a folder" if stat.S_ISDIR(mode) else "a device or a pipe"
+        raise ResourceError(f"{what} stands where a file is to be written", place=path, hint="name a file")
 
 
 def spared(path: Path) -> None:

@@ -55,7 +55,7 @@ def _native(path: Path, stated: Stated) -> Scan:
 # In the order of recognition: the more particular layouts first.
 FORMATS: tuple[Format, ...] = (
     Format("native", is_native, _native, "thermofusion's own folder: scan.json + frames.csv + images", "scan.json"),
-    _reader("recording", ".formats.recorded", "what `thermofusion record` wrote, whole or torn", "recording.mcap"),
+    _reader("recording", ".formats.recorded", "what the verb `record` wrote, whole or torn", "recording.mcap"),
     _reader("ros", ".formats.sensors.ros", "ROS 1 or 2 bag: depth, colour, thermal, cameras", "*.bag, *.db3, *.mcap"),
     _reader("azure-mkv", ".formats.azure", "Azure Kinect recording, without the vendor's library", "*.mkv"),
     _reader("realsense-bag", ".formats.realsense", "RealSense recording, through Open3D", "*.bag"),
