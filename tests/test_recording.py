@@ -441,6 +441,7 @@ def test_a_scan_played_as_devices_is_the_same_scan(tmp_path):
 
 
 CRASH = """
+import signal
 import sys
 from pathlib import Path
 from support.fake_device import Steady
@@ -451,6 +452,7 @@ class Told(Steady):
         for f in frames:
             print(self._next - 1, f.host_ns, flush=True)
         return frames
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell in the background has its children ignore it
 record([lambda: Told(rate_hz=100.0, frames=10**6)], Path(sys.argv[1]), Until(), own_process=False)
 """
 
@@ -464,7 +466,10 @@ def killed(out, after_s, how=signal.SIGKILL):
     while time.monotonic() < until:
         lines.append(process.stdout.readline())
     process.send_signal(how)
-    rest, _ = process.communicate(timeout=20)
+    try:
+        rest, _ = process.communicate(timeout=20)
+    finally:
+        process.kill()
     return [int(line.split()[1]) for line in [*lines, *rest.splitlines()] if line.count(" ") == 1]
 
 

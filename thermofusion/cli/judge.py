@@ -34,7 +34,7 @@ def validate(
     scan, recipe = recording.open(), processing.load()
     with progress(json) as step:
         report = judge(scan, recipe, out=out, folds=folds, motion=motion, progress=step)
-    emit(report, report.text(), json)
+    emit(report.document(), report.text(), json)
 
 
 def compare(

@@ -20,7 +20,7 @@ from ..errors import ResourceError, ScanError
 # Names of temporary files, should a run be killed: `.NAME.PROCESS.RANDOM.part`, and the name's suffix again.
 LEFTOVER = re.compile(r"\..*\.\d+\.[0-9a-f]{8}\.part(\.\w+)?")
 # What every file of this program says of itself within its first bytes; tables, which have no room for it, begin so.
-MARK, TABLES, MARKED_BYTES = b"thermofusion", (b"x_m,y_m,z_m,nx,", b"name,kind,value_degC,"), 1 << 16
+MARK, TABLES, MARKED_BYTES = b"thermofusion", (b"x_m,y_m,z_m,nx,", b"name,kind,value_degC,", b"quantity,name,"), 1 << 16
 FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))  # Windows knows no quota
 # Files of this program's form that are a person's own work.
 PERSONAL = (b"thermofusion-scan/", b"thermofusion-regions/", b"thermofusion-metadata/")

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -72,6 +72,10 @@ class ValidationReport:
     map_error: MapError | None
     motion: MotionVerdict | None = None
     messages: tuple[str, ...] = ()
+
+    def document(self) -> dict[str, Any]:
+        """The content of `validation.json`."""
+        return {"software": f"thermofusion {__version__}", **plain(self)}
 
     def text(self) -> str:
         """For people."""
@@ -135,7 +139,7 @@ def validate(
         scan, recipe, fuse(scan, recipe, out=out, progress=step), folds=folds, motion=motion, progress=step
     )
     if out is not None:
-        write_text(Path(out) / "validation.json", to_json({"software": f"thermofusion {__version__}", **plain(report)}))
+        write_text(Path(out) / "validation.json", to_json(report.document()))
     return report
 
 

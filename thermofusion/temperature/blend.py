@@ -294,7 +294,8 @@ def _gain_pivot_K(problem: ThermalProblem, calibration: Calibration | None) -> f
 
 def _own_noise(noise_K: Float32, normals_K: Float32, own_K2: Float32, points_m: Float32) -> Float32:
     """Noise (V,) K at points_m (V, 3), or what rows around say, own_K2 (V,) K², beyond normals_K (V,) K."""
-    return np.sqrt(np.maximum(noise_K**2, _around(own_K2, points_m, PATCH_M) - normals_K**2)).astype(np.float32)
+    around_K2 = np.nan_to_num(_around(own_K2, points_m, PATCH_M))  # where no row has others to be compared with: 0
+    return np.sqrt(np.maximum(noise_K**2, around_K2 - normals_K**2)).astype(np.float32)
 
 
 def _around(values: NDArray, points_m: NDArray, size_m: float) -> Float:
