@@ -48,8 +48,8 @@ class Background:
 
     view : (N,) row of the thermal views. direction : (N, 3) unit, world, from the camera into the room. radiance : (N,)
     mean over a block as the camera reports it, W m-2 sr-1. spread : (N, K) the same of the whole picture blurred with
-    one sigma of `SPREADS` image widths. u_px, v_px : (N,) a block's middle. n_views : that were looked at; shape_px :
-    height and width of a block, px.
+    one sigma of `SPREADS` image widths. u_px, v_px : (N,) a block's middle. n_views : that were looked at; block_px :
+    side of a block, px.
     """
 
     view: Int
@@ -88,7 +88,7 @@ class BackgroundFinder:
         self._netd_L: float | None = None
 
     def rows(self, frame: int, T_world_thermal: Float, converter: SignalConverter) -> dict[str, NDArray]:
-        """Columns of `Background` that one picture adds; `frame` is its place in the stream."""
+        """Columns of `Background` that the picture `frame` of the stream, from T_world_thermal (4, 4), adds."""
         image = converter.radiance(self._stream.load(frame), self._stream.places[frame])
         mean, noise = self._blocks(image)
         if self._netd_L is None:

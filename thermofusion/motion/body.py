@@ -45,7 +45,7 @@ class BodyMotion:
     __repr__ = brief
 
     def affine_at(self, time_s: float) -> Float32:
-        """(V, 3, 4) what takes each vertex from rest to where it is at a time on the depth clock, p -> A p + b."""
+        """(V, 3, 4) what takes each vertex from rest, m, to where it is at a time on the depth clock: p -> A p + b."""
         return affine(self.field.node_m, self.field.at(time_s), self.binding)
 
     def posed(self, mesh: SurfaceMesh, time_s: float) -> SurfaceMesh:

@@ -54,7 +54,7 @@ class Solution:
     point_m: Float32
 
     def poses(self, kept_s: Float, times_s: Float, T_world_depth: Float) -> Float:
-        """Poses (N, 4, 4) at times_s (N,), corrected as those of the frames at kept_s (M,) were."""
+        """T_world_depth (N, 4, 4) at times_s (N,), corrected as those of the frames at kept_s (M,) were."""
         x = np.stack([np.interp(times_s, kept_s, c) for c in self.correction.T], axis=1)
         return se3_exp(x) @ T_world_depth
 

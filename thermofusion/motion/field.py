@@ -29,9 +29,11 @@ class MotionField:
 
     @classmethod
     def at_rest(cls, node_m: Float, knot_s: Float) -> MotionField:
+        """Nodes node_m (K, 3) that do not move at any of the knots knot_s (F,)."""
         return cls(node_m, knot_s, np.zeros((len(knot_s), len(node_m), 6)))
 
     def moved(self, twist: Float) -> MotionField:
+        """The same nodes and knots with other twists (F, K, 6), rad and m."""
         return replace(self, twist=twist)
 
     def slot(self, time_s: float) -> Slots:
@@ -73,26 +75,26 @@ class BoundPoints:
         return len(self.at_m)
 
 
-def affine(field_nodes: Float, twist: Float, binding: Binding) -> Float32:
-    """(P, 3, 4) float32: the blended motion of every point, p -> A p + b, of nodes (K, 3) with twists (K, 6).
+def affine(node_m: Float, twist: Float, binding: Binding) -> Float32:
+    """(P, 3, 4) float32: the blended motion of every point, p -> A p + b, of nodes node_m (K, 3) with a twist (K, 6).
 
     Linear blending: Σ w_k [R_k (p - g_k) + g_k + t_k] = (Σ w_k R_k) p + Σ w_k (g_k + t_k - R_k g_k).
     """
     R = rotations(twist[:, :3])
-    shift = field_nodes + twist[:, 3:] - np.einsum("kij,kj->ki", R, field_nodes)
+    shift = node_m + twist[:, 3:] - np.einsum("kij,kj->ki", R, node_m)
     whole = np.concatenate([R, shift[:, :, None]], axis=2).reshape(-1, 12).astype(np.float32)
     groups = np.einsum("gn,gnc->gc", binding.weight, whole[binding.node])
     return np.take(groups, binding.group, axis=0).reshape(-1, 3, 4)
 
 
 def displacement(points_m: NDArray, binding: Binding, node_m: Float, twist: Float) -> Float32:
-    """(P, 3) how far points (P, 3) move by twists (K, 6) of the nodes."""
+    """(P, 3) m, how far points_m (P, 3) move by a twist (K, 6) of the nodes at node_m (K, 3)."""
     M = affine(node_m, twist, binding)
     return np.einsum("pij,pj->pi", M[:, :, :3], points_m.astype(np.float32)) + M[:, :, 3] - points_m
 
 
 def carried(points: BoundPoints, M: Float32) -> BoundPoints:
-    """The points moved by affine motions (P, 3, 4), normals turned with them."""
+    """The points moved by affine motions M (P, 3, 4) in metres, normals turned with them."""
     at = np.einsum("pij,pj->pi", M[:, :, :3], points.at_m) + M[:, :, 3]
     normal = np.einsum("pij,pj->pi", M[:, :, :3], points.normal)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.float32(1e-9))

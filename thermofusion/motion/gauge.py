@@ -51,7 +51,8 @@ def _vectors(R: Float) -> Float:
 
 
 def poses_without(field: MotionField, common: Float, times_s: Float, T_world_depth: Float) -> Float:
-    """Camera poses (N, 4, 4) against the body, once a rigid motion of it (F, 4, 4) is the camera's instead."""
+    """Poses T_world_depth (N, 4, 4) at times_s (N,) against the body, once a common rigid motion of it (F, 4, 4) is the
+    camera's instead."""
     twist = se3_log(common)
     slots = [field.slot(float(t)) for t in times_s]
     between = np.array([(1 - s) * twist[a] + s * twist[b] for a, b, s in slots])
@@ -59,7 +60,7 @@ def poses_without(field: MotionField, common: Float, times_s: Float, T_world_dep
 
 
 def unsteady(field: MotionField, times_s: Float, steps: Float) -> Float:
-    """What of corrections (N, 6) to frames at times_s (N,) is no motion linear between knots: jitter of the poses."""
+    """Of steps (N, 6), rad and m, to the poses at times_s (N,), what is no motion linear between knots: jitter."""
     hat = np.zeros((len(times_s), len(field.knot_s)))
     for n, t in enumerate(times_s):
         a, b, s = field.slot(float(t))

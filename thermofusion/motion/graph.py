@@ -36,7 +36,7 @@ class Binding:
         return len(self.group)
 
     def take(self, rows: NDArray) -> Binding:
-        """Of the points `rows` (N,) alone."""
+        """Of the points with indices `rows` (N,) alone."""
         used, group = np.unique(self.group[rows], return_inverse=True)
         return Binding(self.node[used], self.weight[used], group.astype(np.int32))
 
@@ -65,7 +65,7 @@ class Coarse:
 
 
 def thinned(vertices: Float32, triangles: Int, spacing_m: float) -> Coarse:
-    """Vertices (V, 3) m gathered in cells of `spacing_m`, as far as they are joined within the cell.
+    """Vertices (V, 3) m gathered in cells of `spacing_m`, as far as triangles (F, 3) join them within the cell.
 
     Two sheets that pass through one cell (an arm beside the flank) stay two points.
     """
@@ -99,7 +99,7 @@ def build_graph(vertices: Float32, triangles: Int, spacing_m: float) -> NodeGrap
 
 
 def bind(vertices: Float32, triangles: Int, node_m: Float) -> Binding:
-    """Another surface's vertices (V, 3) m bound to nodes at node_m (K, 3), distances along that surface."""
+    """Another surface's vertices (V, 3) m bound to nodes at node_m (K, 3), distances along its triangles (F, 3)."""
     coarse = thinned(vertices, triangles, COARSE_M)
     chosen = cKDTree(coarse.at_m).query(node_m)[1]
     return _bound(coarse, np.asarray(dijkstra(coarse.graph, indices=chosen)))

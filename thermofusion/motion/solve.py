@@ -47,7 +47,7 @@ def _cross(d: Float) -> Float:
 
 
 def held_matrix(graph: NodeGraph, rows: Float) -> Float:
-    """(6K, 6K) normal matrix of the edges' rows (E, 9, 12), and of the pull to rest."""
+    """(6K, 6K) normal matrix, per rad and m, of the edges' rows (E, 9, 12), and of the pull to rest."""
     k = len(graph)
     H = np.zeros((k, k, 6, 6))
     blocks = np.einsum("era,erb->eab", rows, rows)
@@ -61,7 +61,7 @@ def held_matrix(graph: NodeGraph, rows: Float) -> Float:
 
 
 def step_weights(knot_s: Float, twist: Float) -> Float:
-    """(F-1, K, 6) weights of the nodes' steps between knots: a random walk's, robust about twists (F, K, 6).
+    """(F-1, K, 6) weights of the nodes' steps between knots knot_s (F,): a random walk's, robust about twist (F, K, 6).
 
     A foot that is set aside pays once: a step larger than `JUMP_SIGMAS` counts less and less (Cauchy).
     """
@@ -85,6 +85,9 @@ def solve_motion(
     sums: Sums, normal: Normal, J: csr_matrix, twist: Float, held: Float, steps: Float, share: float
 ) -> Solved:
     """One Gauss-Newton step of motion and shape together: data (weights times `share`), held, steps.
+
+    J : (P, 6K) of the points' motion along their normals. twist : (F, K, 6) before, rad and m. held : (6K, 6K) of
+    neighbours and rest. steps : (F-1, K, 6) weights between knots.
 
     Shape, one number a point, is eliminated: what all frames say of a point in common is no motion. That couples all
     knots, so the system is solved by conjugate gradients, with the motion alone (block tridiagonal) as preconditioner.

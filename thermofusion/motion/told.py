@@ -64,7 +64,8 @@ def described(mesh: SurfaceMesh, solution: Solution, binding: Binding, trajector
 
 
 def ranges(times_s: Float, bad: Bool) -> tuple[tuple[float, float], ...]:
-    """(start, stop) s of stretches in which most moments are bad: at least `LEAST_BAD` of them, gaps of one bridged."""
+    """(start, stop) s of stretches in which most of the moments times_s (N,) are bad (N,): `LEAST_BAD` at least, gaps
+    of one bridged."""
     out: list[tuple[float, float]] = []
     bridged = bad.copy()
     bridged[1:-1] |= bad[:-2] & bad[2:]

@@ -36,7 +36,7 @@ class Edges:
 
 
 def smooth_image(image: NDArray) -> Float32:
-    """The image blurred for derivatives; NaN pixels spread as NaN over the kernel."""
+    """The image (H, W) blurred for derivatives; NaN pixels spread as NaN over the kernel."""
     return np.asarray(cv2.GaussianBlur(np.asarray(image, np.float32), (0, 0), BLUR_SIGMA_PX), np.float32)
 
 

@@ -151,7 +151,8 @@ def _shifted(image: Float32, uv: Float, reach: int) -> Float32:
 def measure_outline(
     camera: Camera, view: OutlineView, T_thermal_world: Float, reach_px: float, contrast: Contrast
 ) -> OutlineResidual:
-    """Distances from a view's predicted outline to its image's, where the step there is a body's against the room."""
+    """Distances from a view's outline as T_thermal_world (4, 4) predicts it to its image's, where the step there is a
+    body's against the room."""
     outline = project_contour(camera, T_thermal_world, view.contour)
     edges = find_edges(view.smooth, outline, reach_px, contrast.sign)
     step = contrast.sign * edges.step / contrast.step
@@ -168,7 +169,8 @@ def reach_px(camera: Camera, reach_deg: float) -> float:
 
 
 def weights_about_median(residual: Float) -> tuple[Float, float]:
-    """Tukey's biweights about the median (a common offset is the estimate's business), and the robust scale, px."""
+    """Tukey's biweights (N,) about the median of residuals (N,) (a common offset is the estimate's business), and the
+    robust scale, px."""
     middle = np.median(residual)
     scale = max(mad_sigma(residual - middle), MIN_SCALE_PX)
     return tukey_weight((residual - middle) / (TUKEY * scale)), scale

@@ -34,7 +34,7 @@ class Moved:
     frames: Frames
 
     def of(self, mesh: SurfaceMesh, times_s: Float, up: Float) -> BodyMotion:
-        """The motion of the surface at rest that these frames made. up : (3,) unit."""
+        """The motion of the surface at rest that these frames made. times_s : of the depth stream. up : (3,) unit."""
         s = self.solution
         binding = bind(mesh.vertices_m, mesh.triangles, s.field.node_m)
         trajectory = Trajectory(times_s[self.poses.frame], self.poses.T_world_depth)
@@ -112,6 +112,7 @@ def at_rest(
 ) -> Cleaned:
     """The subject's part of the surface that frames at rest made: what of it lies on the floor `first` found goes too.
 
+    found : vertices (V, 3) m and triangles (F, 3).
     Floor and walls are gone already: frames at rest hold the subject alone.
     """
     vertices, triangles = found

@@ -133,7 +133,7 @@ class ThermalProblem:
 
     @property
     def seen_views(self) -> NDArray[np.intp]:
-        """Views that see the vertices, in order of time."""
+        """(M,) numbers of the views that see the vertices, in order of time."""
         return np.unique(self.observations.view)
 
     def lit_by(self, L_skin: NDArray) -> ThermalProblem:

@@ -150,7 +150,7 @@ def calibrated(
     problem: ThermalProblem, mapped: Mapped
 ) -> tuple[ThermalProblem, Calibration | None, tuple[str, ...], Bool, BlendResult]:
     """The problem in the room as it was seen; the cross-calibration and its messages, or None and why there is none;
-    which vertices (V,) are not skin; a first map, without uncertainty.
+    a mask (V,) of vertices that are not skin; a first map, without uncertainty.
 
     What is not skin takes no part in the calibration.
     """

@@ -38,7 +38,7 @@ class Columns(Protocol):
     """Further linear terms of what is read: a sensor's pattern, say."""
 
     def columns(self, u_px: NDArray, v_px: NDArray, view: NDArray) -> csr_matrix:
-        """(N, Q) derivatives of what is read at pixels u_px, v_px (N,) of views (N,)."""
+        """(N, Q) derivatives, W m-2 sr-1, of what is read at pixels u_px, v_px (N,) of each view (N,)."""
         ...
 
     def precision(self) -> Float:

@@ -43,9 +43,9 @@ class RoomMap:
     """Radiance that the room sends from each direction, W m-2 sr-1, and how far it is known.
 
     coefficients, covariance : (9,), (9, 9) of the harmonics. cells : (N_CELLS,) beyond them; 0 = as the harmonics, or
-    not seen. seen : (N_CELLS,) that some view showed. slope_L : dL/dT at the room's temperature. stated_K,
-    measured_K, difference_sigma_K : mean over all directions as stated, as seen without that, and one sigma of their
-    difference; NaN where nothing was seen.
+    not seen. seen : (N_CELLS,) that some view showed. slope_L : dL/dT at the room's temperature. difference_K,
+    difference_sigma_K : mean over all directions as seen, without what is stated, less as stated, and one sigma of it;
+    NaN where nothing was seen.
     """
 
     coefficients: Float
@@ -79,7 +79,8 @@ class RoomMap:
         return replace(self, coefficients=a, covariance=self.covariance - np.outer(gain, self.covariance[0]))
 
     def with_sides(self, missing: Float, covariance: Float) -> RoomMap:
-        """Together with what an independent witness says of the coefficients of order 1 (3,), with its covariance."""
+        """Together with what a witness finds missing of the coefficients of order 1, (3,) W m-2 sr-1, and its
+        covariance (3, 3)."""
         sides = np.array(ORDERS) == 1
         gain = self.covariance[:, sides] @ np.linalg.inv(self.covariance[np.ix_(sides, sides)] + covariance)
         a = self.coefficients + gain @ (missing - self.coefficients[sides])
@@ -104,7 +105,7 @@ class RoomMap:
 
     @property
     def modes(self) -> Float:
-        """(9, R) independent errors of the coefficients: outer products add up to their covariance."""
+        """(9, R) independent errors of the coefficients, W m-2 sr-1: outer products add up to their covariance."""
         values, vectors = np.linalg.eigh(self.covariance)
         return np.asarray((vectors * np.sqrt(np.maximum(values, 0)))[:, ::-1])
 
@@ -120,7 +121,8 @@ class RoomMap:
 
 
 def unseen_covariance(seen: Bool, slope_L: float) -> Float:
-    """(9, 9) of the harmonics' coefficients: what cells (N_CELLS,) that no view showed may add to them."""
+    """(9, 9) of the harmonics' coefficients, (W m-2 sr-1)²: what cells that no view showed, a mask seen (N_CELLS,), may
+    add to them."""
     direction, weight = cell_directions()[~seen], cell_solid_angles()[~seen] / (4 * np.pi)
     apart = np.arccos(np.clip(direction @ direction.T, -1, 1))
     alike = (UNSEEN_K * slope_L) ** 2 * np.exp(-0.5 * (apart / np.radians(UNSEEN_DEG)) ** 2)

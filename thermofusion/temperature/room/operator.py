@@ -39,7 +39,7 @@ def without_operator(rows: Observations, excess: NDArray, area_m2: float) -> Obs
 
 
 def operator_effect(rows: Observations, excess: NDArray, used: Bool, n_vertices: int) -> Float32:
-    """(V,) the same as the mean over a vertex's rows of a mask (N,); 0 where it has none."""
+    """(V,) the mean of an excess (N,), W m-2 sr-1 m-2, over a vertex's used rows, a mask (N,); 0 where it has none."""
     count = np.bincount(rows.vertex[used], minlength=n_vertices)
     total = np.bincount(rows.vertex[used], excess[used], n_vertices)
     return np.asarray(total / np.maximum(count, 1), np.float32)

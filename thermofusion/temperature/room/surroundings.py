@@ -41,8 +41,8 @@ class SurroundingsResult:
     interpolation : (V, M) sparse, rows sum to 1; `interpolation @ hits` is the whole V x V operator, never formed.
     sample_fraction : (M,) float32, F of the samples.
     transfer : (V, 9) float32, how each spherical harmonic of the room lights a vertex: cosine-weighted over the
-        hemisphere, where the body leaves it free. escaped : (M, D) int16, the cell (`cells`) that each ray of a sample
-        escapes into, -1 = it meets the body.
+        hemisphere, where the body leaves it free.
+    escaped : (M, D) int16, the cell (`geometry.sphere`) that each ray of a sample escapes into, -1 = it meets the body.
     """
 
     body_fraction: Float32
