@@ -14,6 +14,11 @@ HUBER = 1.345  # where Huber's weight begins to fall, in sigmas: likewise
 NORMAL_95 = 1.96  # half width of a normal distribution's 95 % interval, in sigmas
 
 
+def evenly(count: int, most: int) -> NDArray[np.intp]:
+    """(M,) indices of up to `most` of `count` things in a row, evenly from the first to the last."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(np.intp))
+
+
 @dataclass(frozen=True)
 class Statistics:
     """Errors of n values, K. within_95 : share inside ±1.96 of their stated sigma (NaN without a sigma)."""

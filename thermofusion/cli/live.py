@@ -16,7 +16,7 @@ LINE_EVERY_S = 2.0
 APPEARS_S = 60.0  # time for the recording to appear
 
 
-def followed(path: Path, recipe: Recipe) -> Live:
+def followed(path: Path, recipe: Recipe) -> None:
     """Follow the recording at `path` to its end, in the terminal and the browser. Ctrl-C ends the following alone."""
     from ..export.palettes import table
     from ..live.follow import Sections, follow
@@ -38,11 +38,8 @@ def followed(path: Path, recipe: Recipe) -> Live:
     try:
         while not path.exists() and time.monotonic() - begun < APPEARS_S:
             time.sleep(0.1)
-        return follow(path, sections, show)
+        follow(path, sections, show)
     except KeyboardInterrupt:
         note("not followed any further; the result is made of what is there")
-        from ..live.follow import Live as Unseen
-
-        return Unseen()
     finally:
         page.close()

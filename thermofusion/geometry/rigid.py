@@ -100,13 +100,19 @@ def interpolate_trajectory(trajectory: Trajectory, times_s: Float, *, max_gap_s:
     return T[i] @ se3_exp(twist * s[:, None]), valid
 
 
-def rigid_alignment(source: Float, target: Float) -> Float:
-    """T_target_source minimising Σ|T p - q|² over paired points p of source and q of target, (N, 3) m each.
+def rigid_alignment(source: Float, target: Float, weight: Float | None = None) -> Float:
+    """T_target_source minimising Σ w |T p - q|² over paired points p of source and q of target, (N, 3) m each.
 
-    Kabsch's and Umeyama's solution, without scale.
+    Kabsch's and Umeyama's solution, without scale. weight : (N,), None = alike.
     """
-    cs, ct = source.mean(0), target.mean(0)
-    U, _, Vt = np.linalg.svd((source - cs).T @ (target - ct))
+    if weight is None:
+        cs, ct = source.mean(0), target.mean(0)
+        pulled = target - ct
+    else:
+        w = weight / weight.sum()
+        cs, ct = w @ source, w @ target
+        pulled = w[:, None] * (target - ct)
+    U, _, Vt = np.linalg.svd((source - cs).T @ pulled)
     d = np.sign(np.linalg.det(Vt.T @ U.T))
     R = Vt.T @ np.diag([1.0, 1.0, d]) @ U.T
     return pose(R, ct - R @ cs)

@@ -19,6 +19,7 @@ from ..geometry.camera import pixel_rays
 from ..geometry.rays import RayScene, rays_from
 from ..physics.scatter import blurred
 from ..physics.signal import SignalConverter
+from ..robust import evenly
 from ..types import (
     BlackbodyReference,
     Bool,
@@ -160,7 +161,7 @@ def find_background(
 ) -> Background:
     """What up to `MOST_VIEWS` of the views show of the room. Raises ScanError for an image that cannot be read."""
     finder = BackgroundFinder(stream, mesh, references)
-    chosen = np.unique(np.linspace(0, len(views) - 1, min(MOST_VIEWS, len(views))).round().astype(int))
+    chosen = evenly(len(views), MOST_VIEWS)
 
     def one(view: int) -> dict[str, NDArray]:
         return finder.rows(int(views.frame[view]), views.T_world_thermal[view], converter)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..physics.signal import SignalConverter
+from ..robust import evenly
 from ..types import Bool, ThermalStream
 
 FRAMES = 24  # that are looked at, evenly over the recording
@@ -28,7 +29,7 @@ def bad_pixels(stream: ThermalStream, frames: NDArray, converter: SignalConverte
 
     Raises ScanError for an image that cannot be read.
     """
-    chosen = frames[np.unique(np.linspace(0, len(frames) - 1, min(FRAMES, len(frames))).round().astype(int))]
+    chosen = frames[evenly(len(frames), FRAMES)]
     if len(chosen) < MIN_FRAMES:
         return np.zeros(stream.camera.lens.shape, bool)
 

@@ -19,7 +19,7 @@ from ..geometry.sphere import cell_of, harmonics
 from ..physics.band import Band
 from ..physics.scatter import halo, reduced
 from ..physics.signal import SignalConverter
-from ..robust import MAD_PER_SIGMA, TUKEY, tukey_weight
+from ..robust import MAD_PER_SIGMA, TUKEY, evenly, tukey_weight
 from ..types import Camera, Float, Float32, LensScatter, Observations, ThermalStream, ThermalViews
 from .background import SPREADS, Background
 
@@ -125,7 +125,7 @@ def spread_on(
     """(V,) Σ g_k (K_k∗y - y) of the converter's scatter, all of the light spread: what errors of its share do to each
     vertex in the mean of some views, W m-2 sr-1."""
     scatter = (converter.scatter or unknown_scatter()).unit
-    chosen = np.unique(np.linspace(0, len(views) - 1, min(SPREAD_VIEWS, len(views))).round().astype(int))
+    chosen = evenly(len(views), SPREAD_VIEWS)
     edges = np.searchsorted(observations.view, np.arange(len(views) + 1))
     total, count = np.zeros(n_vertices), np.zeros(n_vertices)
     for view in chosen.tolist():

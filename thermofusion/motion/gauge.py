@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..geometry.rigid import invert, pose, se3_exp, se3_log, transform_points
+from ..geometry.rigid import invert, rigid_alignment, se3_exp, se3_log, transform_points
 from ..types import Float
 from .field import MotionField, rotations
 
@@ -19,19 +19,11 @@ def common_motion(field: MotionField, area: Float) -> Float:
         there = field.node_m + twist[:, 3:]
         weight = area.copy()
         for _ in range(ROUNDS):
-            T = _weighted(field.node_m, there, weight)
+            T = rigid_alignment(field.node_m, there, weight)
             off = np.linalg.norm(transform_points(T, field.node_m) - there, axis=1)
             weight = area / (1 + (off / TOGETHER_M) ** 2) ** 2
         out.append(T)
     return np.array(out)
-
-
-def _weighted(source: Float, target: Float, weight: Float) -> Float:
-    w = weight / weight.sum()
-    a, b = w @ source, w @ target
-    U, _, Vt = np.linalg.svd((source - a).T @ (w[:, None] * (target - b)))
-    R = Vt.T @ np.diag([1.0, 1.0, np.sign(np.linalg.det(Vt.T @ U.T))]) @ U.T
-    return pose(R, b - R @ a)
 
 
 def without(field: MotionField, common: Float) -> MotionField:

@@ -19,7 +19,7 @@ from ..errors import ResourceError, ScanError
 from ..files import ros
 from ..files.json import to_json
 from ..files.mcap import McapWriter, Message
-from ..files.whole import probe, write_text
+from ..files.whole import FULL, probe, write_text
 from ..version import __version__
 from .device import Device, StreamInfo
 from .worker import Delivered, Ended, Started, Worker
@@ -237,7 +237,7 @@ class _Recorder:
         for sink in [s for own in self._sinks.values() for s in own]:
             sink.refused()
         if not self.state.disk_full:
-            what = "the disk is full" if e.errno in (errno.ENOSPC, errno.EDQUOT) else f"the disk fails ({e.strerror})"
+            what = "the disk is full" if e.errno in FULL else f"the disk fails ({e.strerror})"
             self.state.problems.append(f"{self.state.folder}: {what}; what was written before is whole")
         self.state.disk_full = True
 

@@ -22,16 +22,10 @@ SAME_AT_EACH_VISIT = ("emissivity0", "gain", "scatter", "scale")
 
 
 @dataclass(frozen=True)
-class BudgetRow:
-    """One input: its own value and standard uncertainty u in `unit`, type A or B, degrees of freedom; sensitivity in K
-    per unit, contribution_K = |sensitivity| u. Without a known input only the contribution stands, the rest is NaN."""
+class BudgetRow(BudgetInput):
+    """One input, and what it does: sensitivity in K per unit, contribution_K = |sensitivity| u. Without a known input
+    only the contribution stands, the rest is NaN."""
 
-    name: str
-    value: float
-    u: float
-    unit: str
-    kind: str
-    freedom: float
     sensitivity: float
     contribution_K: float
 
@@ -56,7 +50,7 @@ class UncertaintyBudget:
         for name, size in contributions_K.items():
             i = known.get(name, BudgetInput(name, np.nan, np.nan, "", "B", np.inf))
             sensitivity = size / i.u if i.u > 0 else np.nan
-            rows.append(BudgetRow(name, i.value, i.u, i.unit, i.kind, i.freedom, sensitivity, size))
+            rows.append(BudgetRow(**vars(i), sensitivity=sensitivity, contribution_K=size))
         rows.sort(key=lambda row: -row.contribution_K)
         combined = float(np.sqrt(sum(row.contribution_K**2 for row in rows)))
         spread = sum(row.contribution_K**4 / row.freedom for row in rows)

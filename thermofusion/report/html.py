@@ -27,6 +27,7 @@ from ..mapping.observe import Mapped
 from ..physics.band import ZERO_DEGC_K, Band
 from ..recipe import Recipe
 from ..regions import Measurer, Region
+from ..robust import evenly
 from ..temperature.solve import Temperature
 from ..types import Float32, UInt8, VertexFlag
 from ..version import __version__
@@ -175,7 +176,7 @@ def _view_maps(reported: Reported, columns: Columns) -> list[dict[str, Any]]:
     if mapped is None or not len(mapped.views) or reported.temperature.calibration is None:
         return []
     band, out = Band(*reported.report.get("band_um", (7.5, 13.5))), []
-    for view in np.unique(np.linspace(0, len(mapped.views) - 1, VIEWS_SHOWN).round().astype(int)).tolist():
+    for view in evenly(len(mapped.views), VIEWS_SHOWN).tolist():
         rows = mapped.observations.select(mapped.observations.view == view)
         seen: Float32 = np.full(len(mesh), np.nan, np.float32)
         seen[rows.vertex] = band.temperature_K(rows.radiance.astype(np.float64)) - ZERO_DEGC_K

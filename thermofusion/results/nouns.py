@@ -62,7 +62,8 @@ def _of_types() -> dict[str, type]:
         "shared-errors/1": SharedErrors,
         "signal-curve/1": SignalCurve,
         "surface-mesh/1": SurfaceMesh,
-        "thermal-camera/1": ThermalCamera,
+        "thermal-camera/2": ThermalCamera,
+        "thermal-camera/1": ThermalCamera,  # without `mount`
         "thermal-mesh/2": ThermalMesh,
         "thermal-mesh/1": ThermalMesh,  # without `residual`
         "thermal-views/1": ThermalViews,
@@ -101,7 +102,8 @@ def stored() -> MappingProxyType[str, type]:
             "mapped/2": Mapped,  # without `unsettled`
             "mapped/1": Mapped,  # without `background`
             "motion/1": MotionResult,
-            "rig/1": RigResult,
+            "rig/2": RigResult,
+            "rig/1": RigResult,  # without `free`, `frame_dt_s`, `depth_scale`
             "room-map/1": RoomMap,
             "sensor-pattern/1": Pattern,
             "temperature/4": Temperature,

@@ -29,6 +29,7 @@ from ..geometry.rigid import interpolate_trajectory, invert
 from ..motion.body import BodyMotion, mesh_at, parted
 from ..progress import Progress, silent
 from ..recipe import InputSection, RigSection
+from ..robust import evenly
 from ..types import Float, Scan, SurfaceMesh, ThermalCamera, ThermalStream, Trajectory, brief
 from .estimate import (
     CLOCK,
@@ -159,7 +160,7 @@ def align(
     result = _refined(measured, begin)
     jitter = frame_times(measured, State.of(result.camera))
     if jitter is not None:
-        result = _with_times(stream, body_at, measured, begin, input.max_pose_gap_ms / 1e3)
+        result = _with_times(stream, body_at, measured, begin, input.max_pose_gap_ms / 1e3) or result
     if begin is camera:
         return result
     if not result.converged:
@@ -198,9 +199,7 @@ def _free(scan: Scan, mesh: SurfaceMesh, trajectory: Trajectory, progress: Progr
 def _frames(stream: ThermalStream, trajectory: Trajectory, max_gap_s: float) -> NDArray[np.intp]:
     """Thermal frames chosen evenly among those whose poses are known a little before and after, too."""
     frames = np.flatnonzero(_placed(stream, trajectory, stream.camera.time_offset_s, 2 * PRIOR_TIME_S, max_gap_s))
-    if len(frames) > MAX_VIEWS:
-        frames = frames[np.round(np.linspace(0, len(frames) - 1, MAX_VIEWS)).astype(int)]
-    return frames
+    return frames[evenly(len(frames), MAX_VIEWS)]
 
 
 def _placed(
@@ -215,8 +214,8 @@ def _placed(
 
 def _with_times(
     stream: ThermalStream, body_at: BodyAt, chosen: OutlineSet, begin: ThermalCamera, max_gap_s: float
-) -> RigResult:
-    """The rig again, with the time of each view unknown, and then the times of all frames.
+) -> RigResult | None:
+    """The rig again, with the time of each view unknown, and then the times of all frames; None where too few show it.
 
     body_at : times -> which surface each view sees. chosen : the views that enter, at their stamps, which jitter.
     """
@@ -224,15 +223,15 @@ def _with_times(
     times = at_start = frame_times(chosen, start, sure=True)
     solved = None
     for _ in range(TIMES_ROUNDS):
-        assert times is not None
+        if times is None:
+            return None
         solved = solve(chosen.later(times.dt_s), start, Stamps(times.dt_s, times.scatter_s))
         if solved is None:
             return _unchanged(begin, TOO_FEW)
         state = solved.state
         times = frame_times(chosen, state, sure=True)
-    assert times is not None
-    assert at_start is not None
-    assert solved is not None
+    if times is None or at_start is None or solved is None:
+        return None
     before = chosen.later(at_start.dt_s).residual_px(start)
     result = _decided(chosen, begin, solved, before, chosen.later(times.dt_s).residual_px(state))
     state = State.of(result.camera)
@@ -242,7 +241,8 @@ def _with_times(
     views, _ = read_outlines(stream, body_at(taken_s), frames.tolist(), T_world_depth @ invert(state.T_thermal_depth))
     seen = frames[[v.row for v in views]]
     times = frame_times(replace(chosen, views=views, times_s=stream.times_s[seen]), state, sure=True)
-    assert times is not None
+    if times is None:
+        return None
     dt_s = np.zeros(len(stream))
     dt_s[seen] = times.dt_s
     text = (

@@ -42,6 +42,14 @@ class OutlineView:
     contour: Contour
     range_m: float
 
+    @classmethod
+    def of(cls, row: int, smooth: Float32, contour: Contour, T_world_thermal: Float) -> OutlineView:
+        """With `MAX_POINTS` at most of a contour as seen from T_world_thermal (4, 4); smooth : (H, W)."""
+        every = -(-len(contour) // MAX_POINTS)
+        thinned = Contour(contour.point_m[::every], contour.normal[::every])
+        range_m = float(np.median(np.linalg.norm(thinned.point_m - T_world_thermal[:3, 3], axis=1)))
+        return cls(row, smooth, thinned, range_m)
+
 
 @dataclass(frozen=True, eq=False)
 class Contrast:
@@ -82,11 +90,8 @@ def read_outlines(
     for row, frame in enumerate(frames):
         contour = caster.posed(mesh_of(row)).contour(T_world_thermal[row])
         if len(contour) >= MIN_POINTS_OF_VIEW:
-            every = -(-len(contour) // MAX_POINTS)
-            thinned = Contour(contour.point_m[::every], contour.normal[::every])
-            range_m = float(np.median(np.linalg.norm(thinned.point_m - T_world_thermal[row, :3, 3], axis=1)))
             radiance = converter.radiance(stream.load(int(frame)), stream.places[frame])
-            views.append(OutlineView(row, smooth_image(radiance), thinned, range_m))
+            views.append(OutlineView.of(row, smooth_image(radiance), contour, T_world_thermal[row]))
         progress("rig", row + 1, len(frames))
     level = [float(np.nanmedian(v.smooth)) for v in views]
     if not np.isfinite(level).any():

@@ -19,6 +19,7 @@ from ..geometry.camera import project
 from ..geometry.rigid import rotation_angle_deg, transform_points
 from ..physics.band import ZERO_DEGC_K
 from ..physics.signal import SignalConverter
+from ..robust import evenly
 from ..types import BlackbodyReference, Camera, Float, Scan, Stream, ThermalStream, UInt8
 from .overlay import OVERLAY_FRAMES, edge_overlays, looks_mirrored
 from .pairing import nearest_in_time
@@ -126,7 +127,7 @@ def _faults(scan: Scan, sample: int) -> Iterator[ScanError]:
 def _sample(stream: Stream, sample: int, *, usable_only: bool = True) -> list[int]:
     """Positions of `sample` frames from first to last."""
     rows = np.flatnonzero(stream.usable) if usable_only and stream.usable.any() else np.arange(len(stream))
-    picks = np.linspace(0, len(rows) - 1, min(max(sample, 1), len(rows))).round().astype(int)
+    picks = evenly(len(rows), max(sample, 1))
     return rows[np.unique(picks)].tolist()
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..geometry.camera import project
 from ..geometry.rigid import interpolate_trajectory, invert, transform_points
+from ..robust import evenly
 from ..types import Bool, Camera, Float, Scan, Stream, UInt8
 from .pairing import nearest_in_time
 
@@ -46,7 +47,7 @@ def edge_overlays(scan: Scan, count: int = OVERLAY_FRAMES) -> list[Overlay]:
     found = []
     for name, stream, camera, T, times_s in _others(scan):
         rows = np.flatnonzero(stream.usable)
-        picks = rows[np.unique(np.linspace(0, len(rows) - 1, min(count, len(rows))).round().astype(int))]
+        picks = rows[evenly(len(rows), count)]
         for i in picks.tolist():
             t = times_s[i]
             k = int(nearest_in_time(np.array([t]), scan.depth.times_s)[0][0])

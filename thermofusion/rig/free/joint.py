@@ -18,7 +18,7 @@ from ...geometry.rigid import invert, se3_exp
 from ...types import Float, Float32
 from ..outlines import measure_outline, reach_px, weights_about_median
 from .outline import OutlineFitter
-from .pattern import COMMON_COLUMNS, OFFSET, POSE, VIEW_COLUMNS, PatternRows, PatternSampler, pattern_normal
+from .pattern import COMMON_COLUMNS, OFFSET, POSE, VIEW_COLUMNS, PatternRows, PatternSampler, of_poses, pattern_normal
 
 REACH_DEG = (0.8, 0.6) + (0.5,) * 8
 BLUR_SHARE = (0.008, 0.004) + (0.002,) * 8  # of the image's width: pattern is compared blurred, then sharp
@@ -154,9 +154,7 @@ def _prior(n: int, contrast: float) -> Float:
 
 def _solved(H: Float, b: Float, prior: Float, n: int) -> tuple[Float, Float]:
     """The step (P,) and every view's covariance (N, 6, 6). prior : (P,) diagonal that keeps the step small."""
-    is_pose = np.zeros(len(b), bool)
-    is_pose[: n * VIEW_COLUMNS] = np.tile(np.arange(VIEW_COLUMNS) < OFFSET, n)
-    loose = H + np.diag(np.where(is_pose, PRIOR_SHARE, 1.0) * prior)
+    loose = H + np.diag(np.where(of_poses(n, len(b)), PRIOR_SHARE, 1.0) * prior)
     size = np.sqrt(np.diag(loose))
     inverse = np.linalg.inv(loose / np.outer(size, size)) / np.outer(size, size)
     at = [slice(k * VIEW_COLUMNS, k * VIEW_COLUMNS + OFFSET) for k in range(n)]

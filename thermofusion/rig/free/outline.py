@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ...geometry.outline import Contour, OutlineCaster, project_contour
+from ...geometry.outline import OutlineCaster, project_contour
 from ...geometry.rigid import invert, rotation_angle_deg, se3_exp
 from ...types import Camera, Float, Float32, SurfaceMesh
 from ..outlines import (
-    MAX_POINTS,
     MIN_POINTS_OF_VIEW,
     Contrast,
     OutlineResidual,
@@ -100,12 +99,7 @@ class OutlineFitter:
 
     def _view(self, row: int, T: Float, caster: OutlineCaster) -> OutlineView | None:
         contour = caster.contour(T)
-        if len(contour) < MIN_POINTS_OF_VIEW:
-            return None
-        every = -(-len(contour) // MAX_POINTS)
-        thinned = Contour(contour.point_m[::every], contour.normal[::every])
-        range_m = float(np.median(np.linalg.norm(thinned.point_m - T[:3, 3], axis=1)))
-        return OutlineView(row, self.images.smooth[row], thinned, range_m)
+        return OutlineView.of(row, self.images.smooth[row], contour, T) if len(contour) >= MIN_POINTS_OF_VIEW else None
 
     def _fit(self, row: int, T: Float, reaches_deg: tuple[float, ...], caster: OutlineCaster) -> Placed:
         prior = np.diag([np.radians(STEP_ROTATION_DEG) ** -2.0] * 3 + [STEP_TRANSLATION_M**-2.0] * 3)

@@ -203,6 +203,13 @@ class _Stacked:
             return np.asarray((fitted - mean[self.vertex]) * np.where(count > 1, np.sqrt(count / (count - 1)), np.nan))
 
 
+def of_poses(n_views: int, columns: int) -> Bool:
+    """(P,) which of the columns, the views' first, are unknowns of poses."""
+    out = np.zeros(columns, bool)
+    out[: n_views * VIEW_COLUMNS] = np.tile(np.arange(VIEW_COLUMNS) < OFFSET, n_views)
+    return out
+
+
 def pattern_normal(views: Sequence[PatternRows], n_vertices: int, floor: float) -> PatternNormal:
     """The normal equations for a step from the poses where the views were read, robustly weighted.
 
@@ -210,9 +217,7 @@ def pattern_normal(views: Sequence[PatternRows], n_vertices: int, floor: float) 
     """
     rows = _Stacked.of(views, n_vertices)
     P = rows.A.shape[1]
-    is_pose = np.zeros(P, bool)
-    is_pose[: len(views) * VIEW_COLUMNS] = np.tile(np.arange(VIEW_COLUMNS) < OFFSET, len(views))
-    nuisance = np.flatnonzero(~is_pose)
+    nuisance = np.flatnonzero(~of_poses(len(views), P))
     weight, x = rows.base.copy(), np.zeros(P)
     for _ in range(REWEIGHTED):
         H, b = rows.normal(weight, nuisance)

@@ -17,6 +17,7 @@ from ...errors import ScanError, counted
 from ...geometry.rigid import invert, rotation_angle_deg, se3_exp, se3_log
 from ...physics.signal import SignalConverter
 from ...progress import Progress, silent
+from ...robust import evenly
 from ...types import Camera, Float, Float32, Int, Scan, SurfaceMesh, ThermalStream, ThermalViews, Trajectory, brief
 from ..edges import smooth_image
 from ..outlines import MIN_STEP_NETD, Contrast
@@ -90,9 +91,7 @@ def place_views(
     stream = scan.thermal
     assert stream is not None
     usable = np.flatnonzero(stream.usable)
-    chosen = usable
-    if len(usable) > MAX_VIEWS:
-        chosen = usable[np.round(np.linspace(0, len(usable) - 1, MAX_VIEWS)).astype(int)]
+    chosen = usable[evenly(len(usable), MAX_VIEWS)]
     if not len(chosen):
         raise ScanError("no thermal frame is usable: all are marked as shutter frames", place=scan.root)
     taken = _Taken.of(scan, chosen)

@@ -19,6 +19,7 @@ from scipy.fft import irfft2, rfft2
 from ...geometry.outline import border_tree
 from ...geometry.rays import RayScene, rays_from
 from ...geometry.rigid import invert
+from ...robust import evenly
 from ...types import Bool, Camera, Float, Float32, SurfaceMesh
 
 BODY_PX = 96  # width of the picture in which the body is told from the room
@@ -69,8 +70,7 @@ def search(mesh: SurfaceMesh, lens: Camera, up: Float, body: NDArray) -> Candida
     focal = lens.focal_px * body.shape[2] / lens.width_px * enlarged
     pictures = _Pictures.of(small)
     silhouettes = cast_silhouettes(mesh, focal, up, small.shape[1:])
-    probes = np.unique(np.round(np.linspace(0, len(body) - 1, PROBES)).astype(int))
-    some = pictures.rows(probes)
+    some = pictures.rows(evenly(len(body), PROBES))
     heard = [np.median(_scan(some, silhouettes, ((90.0 * q, 1.0),))[0].max(axis=1)) for q in QUARTERS]
     quarter = QUARTERS[int(np.argmax(heard))]
     ways = tuple((roll + 90.0 * quarter, scale) for roll in ROLLS_DEG for scale in SCALES)
