@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..geometry.patches import patches
 from ..geometry.rigid import invert, se3_exp
 from ..motion.body import BodyMotion, mesh_at
 from ..progress import Progress, silent
@@ -101,7 +102,7 @@ def view_corrections(
 
 def _black_blocks(view: OutlineView, seen: OutlineResidual) -> Bool:
     """One colour of a 3-D checkerboard over the body, for the outline points that were found."""
-    return np.floor(view.contour.point_m[seen.point] / BLOCK_M).astype(int).sum(1) % 2 == 0
+    return patches(view.contour.point_m[seen.point], BLOCK_M)[1]
 
 
 def _fit(

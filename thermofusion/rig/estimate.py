@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.patches import patches
 from ..geometry.rigid import interpolate_trajectory, invert, se3_exp, se3_log
 from ..robust import mad_sigma
 from ..types import Camera, Float, ThermalCamera, Trajectory
@@ -81,16 +82,16 @@ class OutlineSet:
     def measure(self, state: State, reach: float) -> Measured:
         """Distances between model's and image's outline, edges looked for within `reach` px."""
         T_thermal_world, velocity = self._poses(state)
-        residual, jacobian, cell, point, first = [], [], [], [], 0
+        residual, jacobian, place, point, first = [], [], [], [], 0
         for view, T, twist in zip(self.views, T_thermal_world, velocity, strict=True):
             m = measure_outline(self.lens, view, T, reach, self.contrast)
             residual.append(m.residual_px - state.width_px)
             jacobian.append(np.column_stack([m.motion, m.motion @ twist, np.ones(len(m.motion))]))
-            cell.append(np.floor(view.contour.point_m[m.point] / BLOCK_M).astype(np.int64))
+            place.append(view.contour.point_m[m.point])
             point.append(first + m.point)
             first += len(view.contour)
         index = np.repeat(np.arange(len(residual)), [len(r) for r in residual])
-        block = np.unique(np.concatenate(cell) @ [1_000_003, 1_009, 1], return_inverse=True)[1]
+        block, _ = patches(np.concatenate(place), BLOCK_M)
         return Measured(np.concatenate(residual), np.concatenate(jacobian), index, block, np.concatenate(point))
 
     def later(self, dt_s: Float) -> OutlineSet:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..geometry.patches import patches
 from ..robust import TUKEY, mad_sigma, tukey_weight
 from ..types import Float
 from .estimate import CLOCK, REACH_DEG, TWIST, Measured, OutlineSet, State
@@ -114,8 +115,7 @@ def _solved(m: Measured, lever: Float, n: int, use: np.ndarray | None = None) ->
 
 def _left_out(outlines: OutlineSet, m: Measured, lever: Float) -> tuple[float, float]:
     """Robust rms of each half of the outline, px: as it is, and less the lever times what the other half says."""
-    cell = np.floor(np.concatenate([v.contour.point_m for v in outlines.views])[m.point] / BLOCK_M)
-    black = cell.astype(np.int64).sum(1) % 2 == 0
+    _, black = patches(np.concatenate([v.contour.point_m for v in outlines.views])[m.point], BLOCK_M)
     residual = m.residual_px - np.median(m.residual_px)
     after = residual.copy()
     for half in (black, ~black):

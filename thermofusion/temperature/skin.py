@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from ..geometry.patches import patches
 from ..types import Bool, Float
 from .blend import BlendResult
 from .crosscal import Calibration
 from .problem import ThermalProblem
-from .sensor.criticism import patches
 from .uncertainty import AngleTables, observation_variance
 
 SAMPLE = 8000  # vertices that the slopes are taken from

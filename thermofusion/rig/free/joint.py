@@ -14,8 +14,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...geometry.patches import patches
 from ...geometry.rigid import invert, se3_exp
 from ...types import Float, Float32
+from ..estimate import BLOCK_M
 from ..outlines import measure_outline, reach_px, weights_about_median
 from .outline import OutlineFitter
 from .pattern import COMMON_COLUMNS, OFFSET, POSE, VIEW_COLUMNS, PatternRows, PatternSampler, of_poses, pattern_normal
@@ -30,7 +32,6 @@ PRIOR_COMMON = 0.5  # of field and shape, as a share of the contrast between ski
 SHARP_FROM = 2  # iterations with blur before
 AT_REST = 0.5  # of a sigma: a smaller step ends the iterations; the outline's sampling alone makes one of a third
 SYSTEMATIC_PX = 0.1  # errors of the model's outline that all points of a view share: no average removes them
-BLOCK_M = 0.06  # neighbouring outline this near shares the model's error
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,21 +100,21 @@ def _read(sampler: PatternSampler, image: Float32, T_world_thermal: Float, blur:
 
 @dataclass(frozen=True, eq=False)
 class _OutlineRows:
-    """One view's: residual_px (n,), motion (n, 6) its derivative by the pose, block (n, 3) where on the body."""
+    """One view's: residual_px (n,), motion (n, 6) its derivative by the pose, block (n,) where on the body."""
 
     residual_px: Float
     motion: Float
-    block: NDArray[np.int64]
+    block: NDArray[np.intp]
     range_m: float
 
 
 def _outline_rows(fitter: OutlineFitter, row: int, T_world_thermal: Float, reach_deg: float) -> _OutlineRows:
     view = fitter.view(row, T_world_thermal)
     if view is None:
-        return _OutlineRows(np.zeros(0), np.zeros((0, 6)), np.zeros((0, 3), np.int64), 1.0)
+        return _OutlineRows(np.zeros(0), np.zeros((0, 6)), np.zeros(0, np.intp), 1.0)
     reach = reach_px(fitter.lens, reach_deg)
     m = measure_outline(fitter.lens, view, invert(T_world_thermal), reach, fitter.images.contrast)
-    block = np.floor(view.contour.point_m[m.point] / BLOCK_M).astype(np.int64)
+    block, _ = patches(view.contour.point_m[m.point], BLOCK_M)
     limb = fitter.limb_px(view, T_world_thermal)[m.point]
     return _OutlineRows(m.residual_px - limb, m.motion, block, view.range_m)
 
@@ -129,9 +130,8 @@ def _outline_normal(seen: Sequence[_OutlineRows], width_px: float, columns: int)
         at = np.append(k * VIEW_COLUMNS + np.arange(OFFSET), columns - 1)
         H[np.ix_(at, at)] += J.T @ (w[:, None] * J) / scale**2
         b[at] += J.T @ (w * r) / scale**2
-        group = np.unique(s.block @ [1_000_003, 1_009, 1], return_inverse=True)[1]
         left = w * (r - np.median(r) if len(r) else r)
-        grouped += float((np.bincount(group, left) ** 2).sum())
+        grouped += float((np.bincount(s.block, left) ** 2).sum())
         alone += float((left**2).sum())
     effect = max(1.0, grouped / max(alone, 1e-300))
     return H / effect, b / effect, scale

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
 
 from ...geometry.camera import pixel_rays, project, viewing_cosine
+from ...geometry.patches import patches
 from ...geometry.rays import RayScene, rays_from
 from ...geometry.rigid import invert, transform_points
 from ...physics.emissivity import PRESETS, Fresnel
@@ -180,8 +181,8 @@ class _Stacked:
             shape=(len(rows), n * VIEW_COLUMNS + COMMON_COLUMNS),
         )
         S = csr_array((np.ones(len(rows)), (vertex, rows)), shape=(n_vertices, len(rows)))
-        cell = np.floor(np.concatenate([v.point_m for v in views]) / BLOCK_M).astype(np.int64)
-        group = np.unique(cell @ [1_000_003, 1_009, 1] * n + view, return_inverse=True)[1]
+        block, _ = patches(np.concatenate([v.point_m for v in views]), BLOCK_M)
+        group = np.unique(block * n + view, return_inverse=True)[1]
         value, base = (np.concatenate([getattr(v, k) for v in views]) for k in ("value", "weight"))
         return cls(vertex, group, value, A, S, base)
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
+from ...geometry.patches import patches
 from ...types import Bool, Float, Observations
 from ..system import OverlapSystem, Solution
 
@@ -43,14 +44,6 @@ class Alike:
 
     size_K: float
     z: float
-
-
-def patches(points_m: NDArray, size_m: float) -> tuple[NDArray[np.intp], Bool]:
-    """Number of the cubic patch that each of points_m (N, 3) m lies in, and its colour in a checkerboard, (N,) each."""
-    cell = np.floor(points_m / size_m).astype(np.int64)
-    cell -= cell.min(axis=0, initial=0)
-    number = np.unique(cell @ np.array([1 << 40, 1 << 20, 1]), return_inverse=True)[1]
-    return number, cell.sum(axis=1) % 2 == 0
 
 
 def left_out(system: OverlapSystem, solution: Solution, rows: Observations, points_m: NDArray) -> Residuals:
