@@ -210,17 +210,19 @@ def test_an_absent_library_is_named(name, make, monkeypatch):
         getattr(result(), make)()
 
 
+# What inside functions may be Linux's own: a terminal's keys, and cameras that only V4L2 knows.
+LATE = {"thermofusion/cli/record.py": {"termios", "tty"}, "thermofusion/recording/devices/v4l2.py": {"fcntl"}}
+
+
 def test_types_are_shipped_and_posix_is_not_needed():
     assert (ROOT / "thermofusion" / "py.typed").is_file()
     for path in SOURCES:
         tree = ast.parse(path.read_text(encoding="utf-8"))
-        # Linux's own cameras and terminals are met inside functions that only their owners call
-        late = {"record.py", "v4l2.py"} & {path.name} and {"fcntl", "termios", "tty"}
         for node in ast.walk(tree):
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
-            allowed = late if late and node not in tree.body else set()
-            assert not POSIX_ONLY & {n.split(".")[0] for n in names} - allowed, path
+            late = LATE.get(path.relative_to(ROOT).as_posix(), set()) if node not in tree.body else set()
+            assert not POSIX_ONLY & {n.split(".")[0] for n in names} - late, path
     code = (
         "import os\n"
         "import concurrent.futures, importlib.metadata, platform, subprocess, tempfile, threading, numpy, cv2, open3d\n"

@@ -148,5 +148,11 @@ def test_the_page_is_served_to_this_machine_alone():
             urllib.request.urlopen(page.address + "../etc/passwd")
         refused.value.close()
         assert refused.value.code == 404
+        # a page from elsewhere, whose name was made to lead here
+        elsewhere = urllib.request.Request(page.address + "points.bin", headers={"Host": "example.org"})
+        with pytest.raises(urllib.error.HTTPError) as refused:
+            urllib.request.urlopen(elsewhere)
+        refused.value.close()
+        assert refused.value.code == 404
     finally:
         page.close()

@@ -46,7 +46,9 @@ class Page:
 
     def _handler(self) -> type[BaseHTTPRequestHandler]:
         def answer(request: BaseHTTPRequestHandler) -> None:
-            kind, data = self._answers.get(request.path, ("", b""))
+            # a page from elsewhere whose name was made to lead here asks under that name
+            asked = request.path if request.headers.get("Host") == self.address[len("http://") : -1] else ""
+            kind, data = self._answers.get(asked, ("", b""))
             request.send_response(200 if kind else 404)
             request.send_header("Content-Type", kind or "text/plain")
             request.send_header("Content-Length", str(len(data)))
