@@ -54,6 +54,12 @@ def test_the_demo_finds_the_true_temperatures(demo):
     assert report["tracking"]["tracked"] == report["tracking"]["frames"] == 90
     assert report["temperature"]["anchored"] is True
     assert report["quality"]["failed"] == []
+    stated, used = (row for row in report["radiometry"] if row["what"].startswith("reflected"))
+    assert stated["source"] == "scan.json"
+    assert used["source"] == "background of the views"
+    said, taken = (float(row["value"].split()[0]) for row in (stated, used))
+    low, high = sorted((said, said + report["temperature"]["room"]["mean_differs_from_stated_K"]))
+    assert low - 0.006 <= taken <= high + 0.006  # as both say, to the digits that are told
 
 
 def _to_truth(out):

@@ -7,7 +7,7 @@ TISEM: Moreira et al. 2017, J. Thermal Biology 69, 155, doi:10.1016/j.jtherbio.2
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -15,8 +15,9 @@ from pydantic import Field, JsonValue
 
 from ..files.reading import read_json
 from ..files.strict import Border, validated
+from ..physics.band import ZERO_DEGC_K
 from ..recipe import TemperatureSection
-from ..types import Scan
+from ..types import BudgetInput, Scan
 
 SCHEMA: Literal["thermofusion-metadata/1"] = "thermofusion-metadata/1"
 FILE = "metadata.json"
@@ -122,8 +123,13 @@ def _text(value: object) -> str:
     return text[:LONGEST]
 
 
-def radiometric_numbers(scan: Scan, settings: TemperatureSection) -> list[dict[str, str]]:
-    """Every number that turned signal into temperature, with its unit and where it comes from."""
+def radiometric_numbers(
+    scan: Scan, settings: TemperatureSection, inputs: Sequence[BudgetInput] = ()
+) -> list[dict[str, str]]:
+    """Every number that turned signal into temperature, with its unit and where it comes from.
+
+    inputs : what the temperatures depended on; a room that was seen is told beside what was stated of it.
+    """
     room, e = scan.environment, settings.emissivity
     shape = ", ".join(f"{k} = {v:g}" for k in ("n", "k", "epsilon0") if (v := getattr(e, k)) is not None)
     rows = [("emissivity ε(θ)", f"{e.model}{', ' * bool(shape)}{shape}", "recipe")]
@@ -134,6 +140,10 @@ def radiometric_numbers(scan: Scan, settings: TemperatureSection) -> list[dict[s
             rows.append((what, f"{value:g} °C", source))
         else:
             rows.append((what, "not stated", "assumed: see the notes"))
+    for i in inputs:
+        if i.name == "reflected" and i.kind == "A":
+            seen = f"{i.value - ZERO_DEGC_K:.2f} ± {i.u:.2f} °C"
+            rows.insert(2, ("reflected temperature that was used", seen, "background of the views"))
     if room.relative_humidity_pct is not None:
         rows.append(("humidity", f"{room.relative_humidity_pct:g} %", "scan.json"))
     rows.append(("transmission of a metre of air", f"{settings.transmission_per_m:g}", "recipe"))

@@ -72,7 +72,8 @@ def result_report(scan: Scan, recipe: Recipe, steps: Steps, reused: Sequence[str
         out = beyond_range(steps.temperature.mesh.temperature_degC, *recipe.output.range_degC)
         messages += [f"{out}: `thermofusion export RESULT` draws them again in colours that fit"] if out else []
     if scan.thermal is not None:
-        report["radiometry"] = radiometric_numbers(scan, recipe.temperature)
+        inputs = () if steps.temperature is None else steps.temperature.inputs
+        report["radiometry"] = radiometric_numbers(scan, recipe.temperature, inputs)
         report["band_um"] = scan.thermal.camera.band_um
     report["metadata"] = stated(scan, _answered(recipe, steps))
     diagnosis = _diagnosis(scan, steps)
