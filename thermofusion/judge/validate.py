@@ -212,7 +212,7 @@ def _with_motion(
     scan: Scan, result: Result, report: ValidationReport, recipe: Recipe, folds: int, progress: Progress
 ) -> ValidationReport:
     """Left-out residual with every view's pose corrected by its outline, against `report`'s without."""
-    from ..mapping.motion import view_corrections
+    from ..mapping.corrections import view_corrections
     from ..mapping.observe import SurfaceRays, observe_views
     from ..physics.signal import SignalConverter
 

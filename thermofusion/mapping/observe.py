@@ -41,7 +41,7 @@ from ..types import (
     brief,
 )
 from .background import Background, find_background
-from .motion import MotionResult, view_corrections
+from .corrections import MotionResult, view_corrections
 from .pixels import bad_pixels
 from .references import BlackbodyReading, read_blackbodies
 from .scatter import estimate_scatter, spread_on

@@ -75,7 +75,7 @@ def _of_types() -> dict[str, type]:
 def stored() -> MappingProxyType[str, type]:
     """Name and version -> class. A class whose fields change gets a new version; the old one stays, with its reader."""
     from ..mapping.background import Background
-    from ..mapping.motion import MotionResult
+    from ..mapping.corrections import MotionResult
     from ..mapping.observe import Mapped
     from ..mapping.references import BlackbodyReading
     from ..rig.align import RigResult

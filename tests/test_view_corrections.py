@@ -7,7 +7,7 @@ import pytest
 from support.walkround import blank, ellipsoid, make_scan, walk
 
 from thermofusion.geometry.rigid import invert, se3_exp, transform_points
-from thermofusion.mapping.motion import view_corrections
+from thermofusion.mapping.corrections import view_corrections
 from thermofusion.mapping.views import thermal_views
 from thermofusion.types import Scan, SurfaceMesh
 
