@@ -112,6 +112,22 @@ def test_no_verb_replaces_somebodys_file(world, capsys):
         assert "no result" in refused(capsys, arguments, mine)
 
 
+def test_an_earlier_versions_pictures_may_be_drawn_again(world, capsys):
+    """They bear no mark, but the result counts them among its files; what it does not count stays."""
+    views = world / "result" / "views"
+    views.mkdir()
+    names = ("front", "back", "left", "right", "overview", "uncertainty")
+    for name in names:
+        (views / f"{name}.png").write_bytes(b"an earlier version's")
+    files = [f"views/{name}.png" for name in names]
+    (world / "result" / "result.json").write_text(json.dumps({"thermofusion": "0.1.0", "files": files[1:]}))
+    assert "front.png" in refused(capsys, ["export", "result", "--format", "csv"], "result")
+    (world / "result" / "result.json").write_text(json.dumps({"thermofusion": "0.1.0", "files": files}))
+    with pytest.raises(SystemExit) as stopped:
+        main(["export", "result", "--format", "csv"])
+    assert stopped.value.code == 0, capsys.readouterr().err
+
+
 def test_what_was_written_may_be_written_again(world, capsys):
     """Every file says whose it is: in its first bytes, whatever its form."""
     surface = result_maker.sphere(5, 6)

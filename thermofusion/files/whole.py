@@ -16,11 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ResourceError, ScanError
+from .reading import read_json
 
 # Names of temporary files, should a run be killed: `.NAME.PROCESS.RANDOM.part`, and the name's suffix again.
 LEFTOVER = re.compile(r"\..*\.\d+\.[0-9a-f]{8}\.part(\.\w+)?")
 # What every file of this program says of itself within its first bytes; tables, which have no room for it, begin so.
 MARK, TABLES, MARKED_BYTES = b"thermofusion", (b"x_m,y_m,z_m,nx,", b"name,kind,value_degC,", b"quantity,name,"), 1 << 16
+LISTING = "result.json"  # the file of a result that lists the others
 FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))  # Windows knows no quota
 # Files of this program's form that are a person's own work.
 PERSONAL = (b"thermofusion-scan/", b"thermofusion-regions/", b"thermofusion-metadata/")
@@ -63,7 +65,10 @@ def _free(path: Path) -> None:
 
 
 def spared(path: Path) -> None:
-    """Raises ScanError where a file stands that this program did not write, or that is a person's own work."""
+    """Raises ScanError where a file stands that this program did not write, or that is a person's own work.
+
+    What a result counts among its files is ours, too: earlier versions left no mark in some.
+    """
     try:
         if not path.is_file():
             return
@@ -72,11 +77,21 @@ def spared(path: Path) -> None:
     except OSError:
         return  # whoever writes will say what is the matter
     ours = (MARK in head and not any(kind in head for kind in PERSONAL)) or head.startswith(TABLES)
-    if head and not ours:
+    if head and not ours and not _listed(path):
         hint = "name another one, or remove this one first"
         raise ScanError(
             "a file that thermofusion did not write stands here, and would be replaced", place=path, hint=hint
         )
+
+
+def _listed(path: Path) -> bool:
+    """Whether a result in whose folder, or sub-folder, the file lies counts it among its own."""
+    for folder in path.parents[:2]:
+        with suppress(ScanError):
+            report = read_json(folder / LISTING)
+            known = report.get("files") if isinstance(report, dict) and "thermofusion" in report else None
+            return isinstance(known, list) and path.relative_to(folder).as_posix() in known
+    return False
 
 
 def write_whole(path: str | Path, chunks: Iterable[bytes | NDArray]) -> Path:

@@ -12,12 +12,12 @@ from filelock import FileLock, Timeout
 
 from ..errors import RecipeError, ResourceError, ScanError
 from ..files.reading import read_json
-from ..files.whole import LEFTOVER, probe
+from ..files.whole import LEFTOVER, LISTING, probe
 from ..types import Scan
 from .stages import WORK, scan_id
 
 LOCK = ".thermofusion.lock"
-REPORT = "result.json"  # the file that makes a result: it comes last, and names all others
+REPORT = LISTING  # the file that makes a result: it comes last, and names all others
 VIEWS = "views"
 CHANGING = f"{WORK}/files.json"  # while files are changed over: whose they are, should the run be killed
 # What version 0.1.0 wrote without a list.
