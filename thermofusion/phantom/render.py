@@ -11,10 +11,10 @@ from scipy import sparse
 
 from ..geometry.rigid import invert
 from ..types import Bool, Camera, Float, Float32
-from .physics import Band
 from .scene import RoomConfig
 from .shapes import Mesh
 from .skin import Covering
+from .surround import Surround
 
 RAY_START_M = 2e-4  # a ray that leaves a surface starts this far from it
 MARGIN_PX = 12  # around the subject's outline, for lens distortion and breathing
@@ -75,11 +75,12 @@ class Exchange:
     body_fraction: Float32
 
 
-def exchange(mesh: Mesh, covering: Covering, room: RoomConfig, band: Band, rng: np.random.Generator) -> Exchange:
+def exchange(mesh: Mesh, covering: Covering, surround: Surround, rng: np.random.Generator) -> Exchange:
     """Diffuse reflections between parts of the body, the floor and the room, by rays over every vertex' hemisphere.
 
     A ray that hits the body brings ε(θ) L + (1 - ε(θ)) H of that point, H what *it* receives: `reflections` bounces.
     """
+    room, band = surround.room, surround.band
     n, k = len(mesh), room.rays
     caster = Caster(mesh.vertices_m, mesh.triangles)
     emitted = band.emit(covering.degC).astype(np.float32)
@@ -96,7 +97,7 @@ def exchange(mesh: Mesh, covering: Covering, room: RoomConfig, band: Band, rng: 
         t, prim, uv = caster.hits(o, d)
         hit = np.isfinite(t)
         floor = ~hit & (d[:, 2] < 0) if room.floor else np.zeros(len(d), bool)
-        background = np.where(floor, floor_L, room_L)
+        background = np.where(floor, floor_L, room_L if surround.even else surround.walls(o, d))
         outside[rows] = np.where(hit, 0, background).reshape(-1, k).mean(1)
         fraction[rows] = hit.reshape(-1, k).mean(1)
         corners, weights = mesh.triangles[prim[hit]], corner_weights(uv[hit])
@@ -108,6 +109,9 @@ def exchange(mesh: Mesh, covering: Covering, room: RoomConfig, band: Band, rng: 
         index = (np.repeat(own - start, 3), corners.ravel())
         blocks.append(sparse.coo_matrix((reflect.ravel(), index), shape=(stop - start, n)).tocsr())
     transfer = sparse.vstack(blocks, format="csr") if blocks else sparse.csr_matrix((n, n))
+    if room.things:
+        raised = mesh.vertices_m + RAY_START_M * mesh.normals
+        outside += surround.things_on(raised, mesh.normals, lambda points, place: ~caster.blocked(points, place))
     incoming = outside + share + transfer @ np.full(n, room_L)
     for _ in range(room.reflections):
         incoming = outside + share + transfer @ incoming
@@ -266,7 +270,7 @@ def render_depth(
 
 
 def render_thermal(
-    subject: Subject, camera: Camera, rays: Float, room: RoomConfig, band: Band, T_body: Float, T_world: Float
+    subject: Subject, camera: Camera, rays: Float, surround: Surround, T_body: Float, T_world: Float
 ) -> Float32:
     """Radiance (S·H, S·W) at the lens on the supersampled grid, W m-2 sr-1.
 
@@ -274,21 +278,30 @@ def render_thermal(
     L = τ [ε(θ) L(T) + (1 - ε(θ)) H] + (1 - τ) L(T_air), θ between the sample's own ray and the smooth normal, H the
     mean radiance the point receives.
     """
-    emit = lambda t: float(band.emit(np.array(t)))  # noqa: E731
-    room_L, air_L = emit(room.reflected_degC), emit(room.air_degC)
+    room, emit = surround.room, surround.emit
     wall_L = emit(room.reflected_degC if room.background_degC is None else room.background_degC)
     z, floor = room_distance(room, rays, T_world)
-    image = np.where(floor, FLOOR_EPSILON * emit(room.floor_degC) + (1 - FLOOR_EPSILON) * room_L, wall_L)
+    if surround.even:
+        wall: NDArray | float = wall_L
+    else:
+        wall = surround.seen(T_world[:3, 3], rays.reshape(-1, 3) @ T_world[:3, :3].T).reshape(z.shape)
+    floor_L = FLOOR_EPSILON * emit(room.floor_degC) + (1 - FLOOR_EPSILON) * emit(room.reflected_degC)
+    image = np.where(floor, floor_L, wall)
     hits = subject_hits(subject, camera, rays, T_body)
     eps = subject.covering.emissivity(dominant(subject.covering.material, hits.corners, hits.weights), hits.cos_angle)
     emitted = interpolate(subject.emitted, hits.corners, hits.weights)
     incoming = interpolate(subject.exchange.incoming, hits.corners, hits.weights)
+    if room.operator is not None:
+        T_world_body = T_world @ invert(T_body)
+        points = (hits.eye + hits.z_m[:, None] * hits.direction) @ T_world_body[:3, :3].T + T_world_body[:3, 3]
+        normals = interpolate(subject.mesh.normals, hits.corners, hits.weights) @ T_world_body[:3, :3].T
+        incoming = incoming + surround.operator_on(points, normals, T_world[:3, 3])
     image.ravel()[hits.where] = eps * emitted + (1 - eps) * incoming
     z.ravel()[hits.where] = hits.z_m
     if room.transmission_per_m < 1:
         length = np.where(np.isfinite(z), z, 0) * np.linalg.norm(rays, axis=-1)
         tau = room.transmission_per_m**length
-        image = tau * image + (1 - tau) * air_L
+        image = tau * image + (1 - tau) * emit(room.air_degC)
     return image.astype(np.float32)
 
 

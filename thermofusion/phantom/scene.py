@@ -96,12 +96,37 @@ class PatchConfig(_Strict):
 
 
 @dataclass(frozen=True)
+class ThingConfig(_Strict):
+    """A window, radiator or lamp: an upright rectangle that faces the subject, black, before the wall."""
+
+    center_m: Point
+    width_m: Positive
+    height_m: Positive
+    degC: float
+
+
+@dataclass(frozen=True)
+class OperatorConfig(_Strict):
+    """Who holds the camera, in clothes, on the floor behind it: never in the picture, but reflected by the skin."""
+
+    degC: float = 29.0
+    height_m: Positive = 1.7
+
+
+@dataclass(frozen=True)
 class RoomConfig(_Strict):
     """What surrounds the subject, and the air between."""
 
     reflected_degC: float = 23.0
     reflected_error_K: float = 0.0  # written minus true
-    background_degC: float | None = None  # what the thermal camera sees past the subject; None = reflected_degC
+    background_degC: float | None = None  # what the thermal camera sees past the subject; None = the room as it is
+    side_K: float = 0.0  # one wall is this much warmer than the mean, the opposite one colder
+    side_deg: float = 90.0  # where the warm wall is; 0 = in front of the subject, counted as the walk's start_deg
+    floor_to_ceiling_K: float = 0.0  # how much warmer the ceiling is than the floor
+    span_m: Positive = 3.0  # radius of the room whose walls are uneven
+    ceiling_m: Positive = 2.6  # its height
+    things: tuple[ThingConfig, ...] = ()
+    operator: OperatorConfig | None = None
     air_degC: float = 23.0
     relative_humidity_pct: Annotated[float, Field(ge=0, le=100)] = 40.0
     transmission_per_m: Annotated[float, Field(gt=0, le=1)] = 1.0
@@ -183,6 +208,15 @@ class BlackbodyConfig(_Strict):
 
 
 @dataclass(frozen=True)
+class ScatterConfig(_Strict):
+    """Light that the lens spreads widely: a share of it, under a kernel of this width."""
+
+    share: Share
+    width: Annotated[float, Field(gt=0, le=1)] = 0.1  # of the image's width: sigma, decay, core or radius of the kernel
+    kernel: Literal["gaussian", "exponential", "tail", "disc"] = "gaussian"  # tail: (1 + r²/w²)^-1.5
+
+
+@dataclass(frozen=True)
 class ThermalConfig(_Strict):
     """The thermal camera; None = the preset's value."""
 
@@ -193,6 +227,7 @@ class ThermalConfig(_Strict):
     netd_K: NotNegative | None = None
     psf_sigma_px: NotNegative | None = None
     supersample: Annotated[int, Field(ge=1, le=6)] = 2
+    scatter: tuple[ScatterConfig, ...] = ()  # beside the point spread
     vignetting_K: float = 0.0  # what an image corner shows too little
     drift: DriftConfig = DriftConfig()
     blackbody: BlackbodyConfig | None = None

@@ -17,9 +17,11 @@ from ..types import Bool, Camera, Float, Float32
 from .depth_cameras import DepthCamera, depth_camera, measure_depth, scaled_camera
 from .posture import Posture
 from .render import Caster, Exchange, Subject, Texture, exchange, image_rays, render_color, render_depth, render_thermal
+from .scattering import scattered, wide_camera
 from .scene import SceneConfig
 from .shapes import Mesh, build_shape, vertex_normals
 from .skin import Covering, cover
+from .surround import Surround
 from .thermal_cameras import (
     ThermalCamera,
     blackbody_polygon,
@@ -98,7 +100,7 @@ def build_phantom(scene: SceneConfig, seed: int = 0) -> Phantom:
         seed,
         mesh,
         covering,
-        exchange(mesh, covering, scene.room, thermal.band, stream(SEED_EXCHANGE)),
+        exchange(mesh, covering, _surround(scene, thermal), stream(SEED_EXCHANGE)),
         Motion.of(walk, scene.motion, stream(SEED_MOTION)),
         depth_camera(scene.depth),
         thermal,
@@ -112,6 +114,14 @@ def build_phantom(scene: SceneConfig, seed: int = 0) -> Phantom:
         apart,
         _posture(scene, mesh, depth_times, stream(SEED_POSTURE)),
     )
+
+
+def _surround(scene: SceneConfig, thermal: ThermalCamera) -> Surround:
+    """The room as light. Raises RecipeError for a subject that turns in an uneven room: its light is gathered once."""
+    surround = Surround(scene.room, thermal.band)
+    if scene.walk.subject_turns and not surround.even:
+        raise RecipeError("room.side_K, floor_to_ceiling_K and things need walk.subject_turns = false")
+    return surround
 
 
 def _posture(scene: SceneConfig, mesh: Mesh, times_s: Float, rng: np.random.Generator) -> Posture | None:
@@ -208,13 +218,16 @@ class Studio:
         """What reaches the thermal lens in frame i, supersampled: (S·H, S·W) float32, W m-2 sr-1."""
         p, t = self.phantom, float(self.phantom.thermal_times_s[i])
         T_body, T_world = (T[0] for T in p.thermal_poses(np.array([t])))
-        image = render_thermal(
-            self.subject(t), p.thermal.camera, self.thermal_rays, p.scene.room, p.thermal.band, T_body, T_world
-        )
+        subject, surround = self.subject(t), Surround(p.scene.room, p.thermal.band)
+        image = render_thermal(subject, p.thermal.camera, self.thermal_rays, surround, T_body, T_world)
         blackbody = p.scene.thermal.blackbody
         if blackbody is not None and i in blackbody.frames:
             room = float(p.thermal.band.emit(np.array(p.scene.room.reflected_degC)))
             paint_blackbody(p.thermal, blackbody, image, room)
+        if p.scene.thermal.scatter:
+            camera = wide_camera(p.thermal.camera)
+            wide = render_thermal(subject, camera, image_rays(camera), surround, T_body, T_world)
+            image = scattered(image, wide, p.scene.thermal.scatter, p.thermal.camera.shape)
         return image
 
     def thermal(self, i: int) -> np.ndarray:
