@@ -54,7 +54,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "regions": (*BASE, "export"),
     "report": (*BASE, "physics", "motion", "diagnosis", "export", "regions", *STEPS),
     "results": (*BASE, "motion", "export", "regions", "report", *STEPS),
-    "pipeline": (*BASE, "scans", *STEPS, "export", "report", "results"),
+    "pipeline": (*BASE, "scans", "depth", *STEPS, "export", "report", "results"),
     "handover": (*BASE, "export", "regions", "report"),
     "judge": ALL,
     "calibration": (*BASE, "physics", "scans", "report"),

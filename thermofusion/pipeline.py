@@ -38,6 +38,7 @@ STAGES = (
     Stage("temperature", ("mapping", "temperature"), edition=10, handed_out=RESULT),
 )
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
+KEPT_DEPTH_BYTES, KEPT_THERMAL_BYTES = 256 << 20, 64 << 20  # of images that are not decoded twice
 
 
 def fuse(
@@ -60,6 +61,8 @@ def fuse(
 
     Raises ScanError (unusable input), RecipeError, ResourceError. What was computed before an error stays in `out`.
     """
+    if scan.thermal is not None:  # five rooms look at the same images
+        scan = replace(scan, thermal=scan.thermal.kept(KEPT_THERMAL_BYTES))
     verify(scan)
     run = _Run(scan, recipe, None if out is None else Path(out), progress, redo_from, until)
     if run.folder is None:
@@ -111,6 +114,7 @@ class _Run:
 
     def steps(self) -> Steps:
         """The method: the paper's four steps."""
+        from .depth.filter import DepthFrames
         from .mapping.observe import observe
         from .rig.align import align
         from .surface.surface import fuse_surface
@@ -119,8 +123,10 @@ class _Run:
 
         scan, step = self.scan, self.step
         # 1. Surface
-        tracking = step("tracking", partial(locate, scan))
-        surface = step("surface", partial(fuse_surface, scan, tracking))
+        depth = DepthFrames(scan, self.recipe.input, keep_bytes=KEPT_DEPTH_BYTES)
+        tracking = step("tracking", partial(locate, scan, depth=depth))
+        surface = step("surface", partial(fuse_surface, scan, tracking, depth=depth))
+        del depth  # with the images that it kept
         if surface is None:
             return Steps(tracking)
         mesh, path, window_m = surface.mesh, surface.path(tracking.trajectory), surface.normal_window_m

@@ -7,10 +7,10 @@ are x right, y down, z forward; the centre of the first pixel is (0, 0). NaN mea
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from enum import IntFlag
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -266,6 +266,21 @@ class Stream:
 
     def __len__(self) -> int:
         return len(self.times_s)
+
+    def kept(self, most_bytes: int) -> Self:
+        """The same; images stay in memory, read-only, once they were loaded, as many as fit into `most_bytes`."""
+        images: dict[int, NDArray] = {}
+
+        def load(i: int) -> NDArray:
+            image = images.get(i)
+            if image is None:
+                image = self.load(i)
+                if (len(images) + 1) * image.nbytes <= most_bytes:
+                    image.flags.writeable = False
+                    images[i] = image
+            return image
+
+        return replace(self, load=load)
 
     def __repr__(self) -> str:
         span_s = float(self.times_s[-1] - self.times_s[0]) if len(self) else 0.0

@@ -157,17 +157,29 @@ class DepthFrames:
     camera : the pinhole camera of the images (no distortion).
     """
 
-    def __init__(self, scan: Scan, section: InputSection) -> None:
+    def __init__(self, scan: Scan, section: InputSection, *, keep_bytes: int = 0) -> None:
+        """keep_bytes : of images that stay in memory once they were loaded, for who looks at them again."""
         self._stream, self._section = scan.depth, section
         self._undistort = DepthUndistorter(scan.rig.depth)
         self.camera = self._undistort.camera
+        self._room_bytes = keep_bytes
+        self._kept: dict[int, tuple[tuple[slice, slice], Float32]] = {}  # the part of each that holds depth
 
     def __len__(self) -> int:
         return len(self._stream)
 
     def load(self, i: int) -> Float32:
         """Frame i: (H, W) float32 metres, NaN = none. Raises ScanError naming the file if it cannot be read."""
-        return filter_depth(self._undistort(self._stream.load(i)), self.camera, self._section)
+        if i in self._kept:
+            box, part = self._kept[i]
+            depth: Float32 = np.full(self.camera.shape, np.nan, np.float32)
+            depth[box] = part
+            return depth
+        depth = filter_depth(self._undistort(self._stream.load(i)), self.camera, self._section)
+        if self._room_bytes > 0 and (found := _bounding_box(depth)) is not None:
+            self._kept[i] = found, depth[found].copy()
+            self._room_bytes -= self._kept[i][1].nbytes
+        return depth
 
     def read_ahead(self, frames: Sequence[int]) -> Iterator[tuple[int, Float32]]:
         """(i, depth (H, W) m of frame i) in the order given, a few frames decoded ahead on threads."""

@@ -39,8 +39,11 @@ class SubjectFrames:
     camera : pinhole camera of the images.
     """
 
-    def __init__(self, scan: Scan, *, input: InputSection, subject: SubjectSection) -> None:
-        self._frames, self._subject = DepthFrames(scan, input), subject
+    def __init__(
+        self, scan: Scan, *, input: InputSection, subject: SubjectSection, depth: DepthFrames | None = None
+    ) -> None:
+        """depth : the scan's frames, if they are at hand."""
+        self._frames, self._subject = DepthFrames(scan, input) if depth is None else depth, subject
         self.camera: Camera = self._frames.camera
         rays = pixel_rays(self.camera)
         self._rays: Float32 = (rays / rays[..., 2:]).astype(np.float32)

@@ -18,10 +18,10 @@ HEAD = 33  # bytes of the signature and IHDR, behind which texts may stand
 def encode_png(image: UInt8, texts: Mapping[str, str] = MappingProxyType({}), *, small: bool = False) -> bytes:
     """A picture (H, W, 3) sRGB or grey (H, W), which names this program. texts : by keyword (iTXt, 11.3.4).
 
-    small : at the cost of time.
+    small : a tenth less, in twice the time; level 9 would take ten times more for another two percent.
     """
     texts = {"Software": f"thermofusion {__version__}", **texts}
-    options = [cv2.IMWRITE_PNG_COMPRESSION, 9] if small else []
+    options = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE] if small else []
     _, data = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image, options)
     png = data.tobytes()
     return b"".join([png[:HEAD], *(_text_chunk(k, v) for k, v in texts.items()), png[HEAD:]])

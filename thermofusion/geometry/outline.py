@@ -40,7 +40,7 @@ class OutlineCaster:
     """A mesh prepared for casting its outline into any view."""
 
     def __init__(self, mesh: SurfaceMesh, camera: Camera, steps_across: int = GRID_STEPS_ACROSS) -> None:
-        self._scene = RayScene(mesh.vertices_m, mesh.triangles)
+        self._scene = RayScene.of(mesh)
         self._mesh = mesh
         self._ends = border_ends(mesh)
         self._border = _tree(mesh, self._ends)
@@ -57,7 +57,7 @@ class OutlineCaster:
         if mesh is self._mesh:
             return self
         other = copy(self)
-        other._mesh, other._scene = mesh, RayScene(mesh.vertices_m, mesh.triangles)
+        other._mesh, other._scene = mesh, RayScene.of(mesh)
         other._border = _tree(mesh, self._ends)
         return other
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..types import Bool, Float32, Int
+from ..types import Bool, Float32, Int, SurfaceMesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +53,15 @@ class RayScene:
             self._tensor(np.ascontiguousarray(triangles, np.uint32)),
         )
 
+    @classmethod
+    def of(cls, mesh: SurfaceMesh) -> RayScene:
+        """Of a surface, prepared once for all who ask while the surface is there: that takes as long as a million rays
+        do."""
+        scene = _SCENES.get(mesh)
+        if scene is None:
+            scene = _SCENES[mesh] = cls(mesh.vertices_m, mesh.triangles)
+        return scene
+
     def hits(self, rays: Float32) -> Hits:
         """First hits of rays (N, 6): origin [m] and direction, as `rays_from` makes them."""
         answer = self._scene.cast_rays(self._tensor(np.ascontiguousarray(rays, np.float32)))
@@ -72,6 +82,9 @@ class RayScene:
         distance = np.linalg.norm(points_m - nearest, axis=1)
         uv, normal = answer["primitive_uvs"].numpy(), answer["primitive_normals"].numpy()
         return Hits(distance, triangle, uv, normal, nearest)
+
+
+_SCENES: WeakKeyDictionary[SurfaceMesh, RayScene] = WeakKeyDictionary()  # go with their surfaces
 
 
 def rays_from(origin_m: NDArray, direction: NDArray) -> Float32:

@@ -78,7 +78,7 @@ class BackgroundFinder:
     """A mesh, a camera and its references prepared for asking where a picture shows the room."""
 
     def __init__(self, stream: ThermalStream, mesh: SurfaceMesh, references: Sequence[Reference]) -> None:
-        self._scene = RayScene(mesh.vertices_m, mesh.triangles)
+        self._scene = RayScene.of(mesh)
         self._stream, lens = stream, stream.camera.lens
         self._sources = [r for r in references if isinstance(r, BlackbodyReference)]
         self.block_px = max(1, round(lens.width_px / BLOCKS_ACROSS))

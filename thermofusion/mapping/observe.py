@@ -58,7 +58,7 @@ class SurfaceRays:
         """motion : of the subject, for `at`."""
         self.mesh, self._motion = mesh, motion
         self._moved: Float32 | None = None
-        self._scene = RayScene(mesh.vertices_m, mesh.triangles)
+        self._scene = RayScene.of(mesh)
         self._lifted = mesh.vertices_m + np.float32(NORMAL_OFFSET_M) * mesh.normals
         edges, self._on_boundary = undirected_edges(mesh.triangles)
         self._edge_a, self._edge_b = np.ascontiguousarray(edges[:, 0]), np.ascontiguousarray(edges[:, 1])

@@ -87,13 +87,23 @@ def cast_views(
     width_m = sum(2 * half[_DIRECTIONS[name][0][0]] for name in views)
     room_px = MAX_ASPECT * height_px - len(views) * frame_px
     scale = float(min((height_px - frame_px) / max(2 * half[1], 1e-6), room_px / max(width_m, 1e-6)))
-    scene = RayScene(local - (lo + hi) / 2, surface.triangles)
+    box = _Box((lo + hi) / 2, half, axes)
     with ThreadPoolExecutor(max_workers=2) as pool:
-        return list(pool.map(lambda name: _cast(scene, surface.triangles, name, half, scale, height_px), views))
+        return list(pool.map(lambda name: _cast(surface, box, name, scale, height_px), views))
 
 
-def _cast(scene: RayScene, triangles: Int, name: str, half: Float, scale: float, h: int) -> Cast:
+@dataclass(frozen=True, eq=False)
+class _Box:
+    """Middle and half sizes (3,) m of a surface along right, up and front, the rows of axes (3, 3)."""
+
+    middle: Float
+    half: Float
+    axes: Float
+
+
+def _cast(surface: SurfaceMesh, box: _Box, name: str, scale: float, h: int) -> Cast:
     (axis, sign), (depth_axis, depth_sign) = _DIRECTIONS[name]
+    half, triangles = box.half, surface.triangles
     w = int(np.ceil(2 * half[axis] * scale + 2 * MARGIN * h))
     distance = np.full((RAYS * h, RAYS * w), np.inf, np.float32)
     across = (np.arange(RAYS * w, dtype=np.float32) + 0.5) / RAYS - w / 2  # px from the middle
@@ -102,16 +112,20 @@ def _cast(scene: RayScene, triangles: Int, name: str, half: Float, scale: float,
     columns = np.flatnonzero(np.abs(across) <= half[axis] * scale + 1)
     rows = np.flatnonzero(np.abs(down) <= half[1] * scale + 1)
     block = np.ix_(rows, columns)
-    rays = np.zeros((len(rows), len(columns), 6), np.float32)
-    rays[..., axis] = sign * across[columns] / scale
-    rays[..., 1] = -down[rows, None] / scale
-    rays[..., depth_axis] = depth_sign * (half[depth_axis] + 0.1)
-    rays[..., 3 + depth_axis] = -depth_sign
-    found = scene.hits(rays.reshape(-1, 6))
+    right, up, front = sign * box.axes[axis], box.axes[1], depth_sign * box.axes[depth_axis]
+    eye = box.middle @ box.axes + (half[depth_axis] + 0.1) * front
+    rays = np.empty((len(rows), len(columns), 6), np.float32)
+    np.add(
+        (eye - np.multiply.outer(down[rows] / scale, up)).astype(np.float32)[:, None],
+        np.multiply.outer(across[columns] / scale, right).astype(np.float32),
+        out=rays[..., :3],
+    )
+    rays[..., 3:] = -front
+    found = RayScene.of(surface).hits(rays.reshape(-1, 6))
     distance[block] = found.distance.reshape(len(rows), len(columns))
     hit = np.flatnonzero(found.triangle >= 0)
     row, column = rows[hit // len(columns)], columns[hit % len(columns)]
     weights, corners = barycentric(found.uv[hit]), triangles[found.triangle[hit]]
-    facing = found.normal[hit, depth_axis] * np.float32(depth_sign)
+    facing = found.normal[hit] @ front.astype(np.float32)
     pixel = ((row // RAYS) * w + column // RAYS).astype(np.int32)
     return Cast(name, distance, pixel, corners, weights, facing, scale)

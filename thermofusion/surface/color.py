@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..geometry.camera import project, viewing_cosine
 from ..geometry.rigid import interpolate_trajectory, invert, transform_points
-from ..types import Camera, Float, Float32, Scan, Trajectory, UInt8
+from ..types import Camera, Float, Float32, Scan, SurfaceMesh, Trajectory, UInt8
 
 MAX_VIEWS = 30  # each vertex of a walk round is then seen about ten times
 MIN_COS = 0.3  # views more oblique than 72° carry no colour worth having
@@ -19,16 +19,14 @@ OUTLIER_LEVELS = 20.0  # of 255: farther from the mean than this a view counts l
 UNSEEN = (128, 128, 128)  # vertices that no colour frame saw
 
 
-def color_vertices(
-    scan: Scan, trajectory: Trajectory, vertices: Float32, normals: Float32, max_gap_s: float
-) -> UInt8 | None:
-    """(V, 3) uint8 sRGB of the vertices from up to 30 colour frames, grey where none saw them; None without colour.
-
-    vertices : (V, 3) m. normals : (V, 3) unit.
+def color_vertices(scan: Scan, trajectory: Trajectory, mesh: SurfaceMesh, max_gap_s: float) -> UInt8 | None:
+    """(V, 3) uint8 sRGB of a mesh's vertices from up to 30 colour frames, grey where none saw them; None without
+    colour.
 
     Every view is projected with the camera's full distortion at the frame's own time; weight cos²θ / range². The mean
     is taken twice, the second time with views that disagree with the first mean weighted down.
     """
+    vertices, normals = mesh.vertices_m, mesh.normals
     color, camera = scan.color, scan.rig.color
     if color is None or camera is None or scan.rig.T_color_depth is None:
         return None

@@ -80,17 +80,20 @@ def fuse_surface(
     input: InputSection,
     subject: SubjectSection,
     surface: SurfaceSection,
+    depth: DepthFrames | None = None,
     progress: Progress = silent,
 ) -> SurfaceResult:
     """Fuse a scan's depth frames into the surface of its subject.
 
     A floor that tracking saw is refined on the surface, else one is looked for, as the recipe says. Before a standing
-    camera the room is masked out as in tracking. progress : called with ("surface", frames done, frames in all).
+    camera the room is masked out as in tracking. depth : the scan's frames, if they are at hand.
+    progress : called with ("surface", frames done, frames in all).
 
     Raises ScanError if no frame has a pose or no surface results, ResourceError if the grid cannot fit into memory.
     """
     turning = subject.motion == "subject"
-    frames: Frames = SubjectFrames(scan, input=input, subject=subject) if turning else DepthFrames(scan, input)
+    depth = DepthFrames(scan, input) if depth is None else depth
+    frames: Frames = SubjectFrames(scan, input=input, subject=subject, depth=depth) if turning else depth
     max_gap_s = input.max_pose_gap_ms / 1e3
     poses = depth_poses(scan, tracked.trajectory, max_gap_s)
     survey = survey_depth(scan, frames, poses)
@@ -99,8 +102,7 @@ def fuse_surface(
     grid, plan = integrate_frames(survey, seen, poses, plan, input=input, surface=surface, progress=progress)
     found = _extracted(grid, len(poses.frame), surface.min_weight, scan)
     clean = subject_only(*found, survey, plan, subject=subject, floor_plane=tracked.floor_plane)
-    mesh, trajectory, motion = _finished(clean, plan, surface, scan), tracked.trajectory, None
-    moved = None
+    mesh, trajectory, motion, moved = _finished(clean, plan, surface, scan), tracked.trajectory, None, None
     if isinstance(seen, Remembering):
         rigid = RigidFusion(seen, scan.depth.times_s, poses, survey, plan, clean, mesh)
         moved = rigid.moved(input=input, subject=subject, surface=surface)
@@ -114,8 +116,7 @@ def fuse_surface(
         motion = moved.of(mesh, scan.depth.times_s, up)
         trajectory = motion.trajectory
     if surface.color:
-        color = color_vertices(scan, trajectory, mesh.vertices_m, mesh.normals, max_gap_s)
-        mesh = replace(mesh, color_rgb=color)
+        mesh = replace(mesh, color_rgb=color_vertices(scan, trajectory, mesh, max_gap_s))
     return SurfaceResult(
         mesh=mesh,
         voxel_m=plan.voxel_m,

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..depth.filter import read_ahead
+from ..depth.filter import DepthFrames, read_ahead
 from ..depth.subject import SubjectFrames
 from ..geometry.camera import project
 from ..geometry.rigid import transform_points
@@ -69,10 +69,16 @@ class TrackingFrames:
 
     @classmethod
     def of(
-        cls, scan: Scan, *, input: InputSection, subject: SubjectSection, tracking: TrackingSection
+        cls,
+        scan: Scan,
+        *,
+        input: InputSection,
+        subject: SubjectSection,
+        tracking: TrackingSection,
+        depth: DepthFrames | None = None,
     ) -> TrackingFrames:
         """Of a recording; a few probes tell its distance and whether its shape slides."""
-        full = SubjectFrames(scan, input=input, subject=subject)
+        full = SubjectFrames(scan, input=input, subject=subject, depth=depth)
         s = max(1, round(full.camera.width_px / WIDTH_PX))
         K = full.camera.K
         # the centre of a cell of s x s pixels lies (s - 1)/2 from its first pixel's centre

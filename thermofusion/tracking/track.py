@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ..depth.filter import DepthFrames
 from ..errors import ScanError
 from ..geometry.rigid import interpolate_trajectory, invert, se3_exp, se3_log
 from ..progress import Progress, silent
@@ -79,23 +80,25 @@ def locate(
     input: InputSection,
     subject: SubjectSection,
     tracking: TrackingSection,
+    depth: DepthFrames | None = None,
     progress: Progress = silent,
 ) -> TrackingResult:
     """Where the depth camera was: the recorded trajectory, or it refined, or estimated from the depth alone.
 
-    A recorded trajectory is held against the depth first (`recorded.believed`); QualityError where it cannot be right.
+    depth : the scan's frames, if they are at hand. A recorded trajectory is held against the depth first
+    (`recorded.believed`); QualityError where it cannot be right.
     Raises ScanError if a recorded trajectory is asked for and there is none, or no frame shows the subject.
     """
     if tracking.source == "recorded" and scan.trajectory is None:
         raise ScanError("no trajectory was recorded", place=scan.root, hint="set tracking.source to auto or estimate")
     if scan.trajectory is None or tracking.source == "estimate":
         scan = replace(scan, trajectory=None)
-        return track(scan, input=input, subject=subject, tracking=tracking, progress=progress)
+        return track(scan, input=input, subject=subject, tracking=tracking, depth=depth, progress=progress)
     trajectory, messages = believed(scan)
     scan = replace(scan, trajectory=trajectory)
     if not tracking.refine:
         return recorded(scan, messages)
-    result = track(scan, input=input, subject=subject, tracking=tracking, progress=progress)
+    result = track(scan, input=input, subject=subject, tracking=tracking, depth=depth, progress=progress)
     return replace(result, messages=(*messages, *result.messages))
 
 
@@ -114,13 +117,14 @@ def track(
     input: InputSection,
     subject: SubjectSection,
     tracking: TrackingSection,
+    depth: DepthFrames | None = None,
     progress: Progress = silent,
 ) -> TrackingResult:
     """Track the depth camera through a scan; a recorded trajectory, if there is one, is the start.
 
-    Raises ScanError if no frame shows the subject.
+    depth : the scan's frames, if they are at hand. Raises ScanError if no frame shows the subject.
     """
-    frames = TrackingFrames.of(scan, input=input, subject=subject, tracking=tracking)
+    frames = TrackingFrames.of(scan, input=input, subject=subject, tracking=tracking, depth=depth)
     indices = np.flatnonzero(scan.depth.usable)
     if scan.trajectory is not None:
         T, valid = interpolate_trajectory(scan.trajectory, scan.depth.times_s, max_gap_s=input.max_pose_gap_ms / 1e3)

@@ -78,7 +78,7 @@ class PatternSampler:
             mesh.vertices_m[::every].astype(np.float64),
             mesh.normals[::every].astype(np.float64),
             room,
-            RayScene(mesh.vertices_m, mesh.triangles),
+            RayScene.of(mesh),
             pixel_rays(lens, u, v),
         )
 

@@ -121,7 +121,7 @@ def cast_silhouettes(mesh: SurfaceMesh, focal_px: float, up: Float, shape: tuple
     h, w = 2 * shape[0], 2 * shape[1]
     v, u = np.mgrid[0:h, 0:w]
     rays = np.stack([(u - (w - 1) / 2) / focal_px, (v - (h - 1) / 2) / focal_px, np.ones((h, w))], axis=-1)
-    scene, border = RayScene(mesh.vertices_m, mesh.triangles), border_tree(mesh)
+    scene, border = RayScene.of(mesh), border_tree(mesh)
     low, high = np.percentile(mesh.vertices_m, [1, 99], axis=0)
     middle = (low + high) / 2
     out = []

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...physics.band import ZERO_DEGC_K, Band
-from ...physics.emissivity import EmissivityModel
+from ...physics.emissivity import AngleTable, EmissivityModel
 from ...types import Bool, Float32, Observations
 
 CLOTHES_DEGC = 29.0  # of a clothed person's outside
@@ -26,9 +26,8 @@ LEAST_RANGE_M = 0.3  # nearer a camera is held before the body, not the body bef
 def operator_excess(rows: Observations, emissivity: EmissivityModel, band: Band, room_K: float) -> Float32:
     """(N,) what a square metre of operator adds to each reading, W m-2 sr-1 m-2."""
     warmer = float(band.radiance(CLOTHES_DEGC + ZERO_DEGC_K) - band.radiance(room_K))
-    cos = rows.cos_angle.astype(np.float64)
-    filled = cos / (np.pi * np.maximum(rows.range_m, LEAST_RANGE_M) ** 2)
-    return np.asarray((1 - emissivity(cos)) * filled * warmer, np.float32)
+    reflected = np.float32(warmer / np.pi) * (1 - AngleTable.of(emissivity)(rows.cos_angle))
+    return np.asarray(reflected * rows.cos_angle / np.maximum(rows.range_m, np.float32(LEAST_RANGE_M)) ** 2)
 
 
 def without_operator(rows: Observations, excess: NDArray, area_m2: float) -> Observations:

@@ -162,7 +162,7 @@ def _hemispheres(normals: Float32, directions: int) -> Float32:
 def _cast(mesh: SurfaceMesh, origins: Float32, rays: Float32) -> tuple[Hits, Bool]:
     """First hits of M x D rays, and whether a hit shows its front."""
     starts = np.repeat(origins, len(rays) // len(origins), axis=0)
-    hits = RayScene(mesh.vertices_m, mesh.triangles).hits(np.concatenate([starts, rays], 1, dtype=np.float32))
+    hits = RayScene.of(mesh).hits(np.concatenate([starts, rays], 1, dtype=np.float32))
     return hits, (hits.normal * rays).sum(1) < 0
 
 
