@@ -61,8 +61,9 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "recording": (*BASE, "physics", "scans"),
     "live": (*BASE, "physics", "depth", "scans", "tracking"),
     "phantom": (*NOUNS, "files", "geometry"),
+    "batch": ALL,
     "paper": (*ALL, "judge", "phantom"),
-    "cli": (*ALL, "judge", "calibration", "recording", "live", "phantom", "paper", "handover"),
+    "cli": (*ALL, "batch", "judge", "calibration", "recording", "live", "phantom", "paper", "handover"),
     "__init__": ALL,
     "__main__": ("cli", "errors"),
 }
@@ -70,7 +71,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
 CALIBRATION = {"board": (), "detect": ("board",), "fit": ("board", "detect"), "thermal": ()}
 # A module of one room that another may use, although the room itself is closed to it.
 PHANTOM_GEOMETRY = {"geometry.rigid", "geometry._open3d"}
-ONE_PLACE = {"usb": {"recording"}, "typer": {"cli"}, "rich": {"cli"}}
+ONE_PLACE = {"usb": {"recording"}, "distributed": {"batch"}, "fsspec": {"batch"}, "typer": {"cli"}, "rich": {"cli"}}
 PRINTS_OR_EXITS = ("print", "sys.exit", "exit", "quit")
 MOST_FILES, MOST_ON_TOP, MOST_LINES, MOST_ARGUMENTS, MANY_ARGUMENTS, WITH_MANY = 16, 10, 60, 9, 7, 4
 
@@ -186,7 +187,7 @@ def test_only_the_command_line_prints_or_exits():
 
 
 def test_only_the_pipeline_and_what_stands_on_it_take_the_whole_recipe():
-    above = ("recipe", "pipeline", "cli", "judge", "results", "report", "paper")
+    above = ("recipe", "pipeline", "batch", "cli", "judge", "results", "report", "paper")
     for path in sources():
         if module_of(path)[0] in above:
             continue

@@ -87,3 +87,18 @@ class ResourceError(ThermofusionError):
     """Memory, disk or a device is not sufficient or not there."""
 
     exit_code = 5
+
+
+class BusyError(ResourceError):
+    """Another run has the result folder."""
+
+
+def exit_of(error: BaseException) -> tuple[int, str]:
+    """The exit code of the command line for an error, and its one sentence."""
+    if isinstance(error, ThermofusionError):
+        return error.exit_code, error.sentence()
+    if isinstance(error, MemoryError):
+        return 5, "out of memory; choose a larger surface.voxel_mm or a smaller --max-memory"
+    if isinstance(error, OSError):  # a stream that is full or gone, a folder that was refused
+        return 5, f"{error.filename or 'a stream'}: it cannot be used ({error.strerror})"
+    return 1, _clause(f"{type(error).__name__}: {error}")

@@ -14,11 +14,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .errors import RecipeError
+from .errors import RecipeError, ScanError
+from .files.reading import read_json
 from .progress import Progress, silent
 from .recipe import RENAMED_STAGES, Recipe
 from .report.summary import Steps, summary
-from .results.claim import claimed
+from .results.claim import REPORT, claimed, listed
 from .results.folder import RESULT, Result, add_files, load_mesh, names_of, write_result
 from .results.frame import frame_of
 from .results.stages import Computes, Stage, StagePlan, Stages, fingerprint, run_id
@@ -80,6 +81,24 @@ def plan(scan: Scan, recipe: Recipe, out: Path, *, redo_from: str | None = None)
     return [run.stages.plan(stage, anew=number >= run.first_anew) for number, stage in enumerate(STAGES)]
 
 
+def finished(scan: Scan, recipe: Recipe, out: Path) -> dict[str, Any] | None:
+    """The report of a result that is what `fuse` would write; None where a file is missing or an input changed."""
+    try:
+        report = read_json(out / REPORT)
+    except ScanError:
+        return None
+    run = _Run(scan, recipe, out)
+    last = STAGE_NAMES.index("surface" if scan.thermal is None else STAGE_NAMES[-1])
+    reusable = [run.stages.plan(stage).reuse for stage in STAGES[: last + 1]][-1]
+    known = isinstance(report, dict) and report.get("run") == run_id(run.stages.key, _said(recipe))
+    whole = known and reusable and all((out / name).is_file() for name in listed(out))
+    return report if whole else None
+
+
+def _said(recipe: Recipe) -> dict[str, Any]:
+    return recipe.output.model_dump(mode="json")
+
+
 class _Run:
     """One way from a recording to a result."""
 
@@ -101,7 +120,7 @@ class _Run:
         """All steps, each reused or computed."""
         self.stages.tidy()
         steps, output = self.steps(), self.recipe.output
-        run = run_id(self.stages.key, output.model_dump(mode="json"))
+        run = run_id(self.stages.key, _said(self.recipe))
         result = Result.of(self.scan, self.recipe, steps, self.stages.reused, run)
         if output.compare_methods and steps.surface and steps.mapped and steps.temperature:
             from .temperature.solve import compare_methods
@@ -177,4 +196,15 @@ def _position(name: str | None, default: int) -> int:
     return STAGE_NAMES.index(name)
 
 
-__all__ = ["STAGES", "STAGE_NAMES", "Result", "add_files", "fuse", "load_mesh", "plan", "summary", "write_result"]
+__all__ = [
+    "STAGES",
+    "STAGE_NAMES",
+    "Result",
+    "add_files",
+    "finished",
+    "fuse",
+    "load_mesh",
+    "plan",
+    "summary",
+    "write_result",
+]

@@ -17,9 +17,9 @@ os.environ |= {f"{name}_NUM_THREADS": "1" for name in ("OPENBLAS", "MKL", "BLIS"
 
 import typer
 
-from ..errors import INTERRUPTED, INTERRUPTED_SENTENCE, ThermofusionError
+from ..errors import INTERRUPTED, INTERRUPTED_SENTENCE, ThermofusionError, exit_of
 from ..version import __version__
-from . import calibrate, inspect, judge, paper, process, record, recordings, report, thermal
+from . import batch, calibrate, inspect, judge, paper, process, record, recordings, report, thermal
 from .console import READER_GONE, fail, help_alone, leave
 
 app = typer.Typer(
@@ -28,7 +28,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (process, report, inspect, record, recordings, judge, calibrate, thermal, paper):
+for group in (process, batch, report, inspect, record, recordings, judge, calibrate, thermal, paper):
     group.register(app)
 
 
@@ -51,16 +51,13 @@ def main(argv: list[str] | None = None) -> None:
         code = app(args=arguments, standalone_mode=False)
     except SystemExit as e:
         leave(READER_GONE if e.code == 1 else int(e.code or 0))  # 1 is the library's own, for a pipe that nobody reads
-    except ThermofusionError as e:
-        fail(e.sentence(), e.exit_code, as_json)
     except (KeyboardInterrupt, typer.Abort):
         fail(INTERRUPTED_SENTENCE, INTERRUPTED, as_json)
-    except MemoryError:
-        fail("out of memory; choose a larger surface.voxel_mm or a smaller --max-memory", 5, as_json)
-    except OSError as e:  # a stream that is full or gone, a folder that was refused
-        if e.errno == errno.EPIPE:
+    except (ThermofusionError, MemoryError, OSError) as e:
+        if isinstance(e, OSError) and e.errno == errno.EPIPE:
             leave(READER_GONE)
-        fail(f"{e.filename or 'a stream'}: it cannot be used ({e.strerror})", 5, as_json)
+        code, sentence = exit_of(e)
+        fail(sentence, code, as_json)
     except Exception as e:
         if hasattr(e, "format_message"):  # a usage error of the command line itself
             fail(f"{e.format_message()} (see --help)", 2, as_json)

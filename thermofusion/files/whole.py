@@ -21,7 +21,11 @@ from .reading import read_json
 # Names of temporary files, should a run be killed: `.NAME.PROCESS.RANDOM.part`, and the name's suffix again.
 LEFTOVER = re.compile(r"\..*\.\d+\.[0-9a-f]{8}\.part(\.\w+)?")
 # What every file of this program says of itself within its first bytes; tables, which have no room for it, begin so.
-MARK, TABLES, MARKED_BYTES = b"thermofusion", (b"x_m,y_m,z_m,nx,", b"name,kind,value_degC,", b"quantity,name,"), 1 << 16
+MARK, TABLES, MARKED_BYTES = (
+    b"thermofusion",
+    (b"x_m,y_m,z_m,nx,", b"name,kind,value_degC,", b"quantity,name,", b"scan,status,exit_code,"),
+    1 << 16,
+)
 LISTING = "result.json"  # the file of a result that lists the others
 FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))  # Windows knows no quota
 # Files of this program's form that are a person's own work.

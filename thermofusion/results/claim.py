@@ -10,7 +10,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from ..errors import RecipeError, ResourceError, ScanError
+from ..errors import BusyError, RecipeError, ResourceError, ScanError
 from ..files.reading import read_json
 from ..files.whole import LEFTOVER, LISTING, probe
 from ..types import Scan
@@ -70,7 +70,7 @@ def _locked(folder: Path) -> Iterator[None]:
         lock.acquire()
     except Timeout:
         hint = "wait until it has ended, or name another folder with -o"
-        raise ResourceError("another run is writing into this folder", place=folder, hint=hint) from None
+        raise BusyError("another run is writing into this folder", place=folder, hint=hint) from None
     except (OSError, ValueError, RuntimeError, NotImplementedError) as e:
         cause = getattr(e, "strerror", None) or e
         raise ResourceError(f"the result folder cannot be written ({cause})", place=folder) from None

@@ -141,8 +141,12 @@ class Stages:
 
 
 def fingerprint(scan: Scan) -> str:
-    """Hash of all that a scan says and of its files' names, sizes and times (their bytes are not read)."""
+    """Hash of all that a scan says and of its files' names, sizes and times (their bytes are not read).
+
+    Names are taken from the scan's own folder: a scan that was moved as it is, is the same.
+    """
     h = hashlib.sha256()
+    home = f"{scan.root}/"
     streams = ("depth", "color", "thermal")
     for stream in (scan.depth, scan.color, scan.thermal):
         if stream is None:
@@ -151,7 +155,9 @@ def fingerprint(scan: Scan) -> str:
         for place in stream.places:
             try:
                 stat = Path(place).stat()
-                h.update(f"{place} {stat.st_size} {stat.st_mtime_ns};".encode("utf-8", "surrogateescape"))
+                h.update(
+                    f"{place.removeprefix(home)} {stat.st_size} {stat.st_mtime_ns};".encode("utf-8", "surrogateescape")
+                )
             except OSError:
                 h.update(place.encode("utf-8", "surrogateescape"))
     rest = {f.name: getattr(scan, f.name) for f in dataclasses.fields(scan) if f.name not in (*streams, "root")}
