@@ -9,7 +9,7 @@ import pytest
 from thermofusion.errors import RecipeError
 from thermofusion.recipe import Recipe, load_recipe, shipped_recipes
 
-SHIPPED = ["full-body", "head", "limb", "phantom-cylinder", "torso", "turntable-object"]
+SHIPPED = ["full-body", "head", "limb", "phantom-cylinder", "room", "torso", "turntable-object"]
 
 
 def test_the_shipped_recipes_are_there_commented_and_round_trip():

@@ -1,6 +1,6 @@
 """Tracks a scan with its poses withheld and prints error and time.
 
-    python tests/benchmarks/bench_tracking.py SCAN [--recipe torso] [--set key=value] [--frames N] [--repeat]
+    python tests/benchmarks/bench_tracking.py SCAN [--recipe torso] [--set key=value] [--frames N] [--every N]
 
 Truth is SCAN/truth/trajectory.txt, else the recording's own poses; ATE after rigid alignment of positions.
 """
@@ -29,12 +29,13 @@ def main() -> None:
     parser.add_argument("--recipe", default="torso")
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE")
     parser.add_argument("--frames", type=int, help="only the first so many depth frames")
+    parser.add_argument("--every", type=int, default=1, help="every so many frames of them, as a slower camera")
     parser.add_argument("--repeat", action="store_true", help="track twice and compare the poses")
     o = parser.parse_args()
     scan = open_scan(o.scan)
     truth_file = o.scan / "truth" / "trajectory.txt"
     truth = read_trajectory(truth_file) if truth_file.is_file() else scan.trajectory
-    scan = replace(scan, trajectory=None, depth=first(scan.depth, o.frames))
+    scan = replace(scan, trajectory=None, depth=some(scan.depth, o.frames, o.every))
     recipe = load_recipe(o.recipe, o.overrides)
 
     wall, cpu = time.perf_counter(), time.process_time()
@@ -57,12 +58,12 @@ def main() -> None:
         print(f"repeat       largest difference {np.abs(again - result.trajectory.T_world_depth).max():.1e}")
 
 
-def first(stream: Stream, count: int | None) -> Stream:
-    """The first `count` images of a stream."""
-    if count is None:
-        return stream
+def some(stream: Stream, count: int | None, every: int) -> Stream:
+    """The first frames of a stream, every so many of them."""
+    pick = slice(0, count, every)
+    at = range(len(stream))[pick]
     return Stream(
-        stream.times_s[:count], stream.load, stream.places[:count], stream.index[:count], stream.usable[:count]
+        stream.times_s[pick], lambda i: stream.load(at[i]), stream.places[pick], stream.index[pick], stream.usable[pick]
     )
 
 

@@ -25,7 +25,7 @@ def solve_jointly(
     *,
     fixed: int = 0,
     stride: int = 1,
-    max_iterations: int = 15,
+    max_iterations: int = 30,
 ) -> tuple[Float, float, bool]:
     """All poses (F, 4, 4) T_world_map at once, from point-to-plane residuals over all edges (source, target).
 

@@ -21,17 +21,24 @@ from .maps import DepthMap
 MAX_NORMAL_DEG = 45.0  # partners must face alike
 MIN_PARTNERS = 150  # a twentieth of a frame's points: fewer fix no pose
 NOISE_FLOOR_M = 3e-4  # at 1 m: no spread of residuals is believed to be smaller
+RANGE_BIAS_1_M = (
+    0.01  # a depth camera's own error grows as z², here at 1 m: what two views have in common of it cancels
+)
 REACH_M = 0.05  # of the partners that judge a motion
 INTENSITY_FLOOR = 0.05  # of the normalised intensity, whose local spread is about 1
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Linear equations direction·(motion of point) = -residual. points, directions : (N, 3); residual : (N,)."""
+    """Linear equations direction·(motion of point) = -residual. points, directions : (N, 3); residual : (N,).
+
+    range_bias : (N,) m, what views from unlike distances may differ by, however often they say it; 0 for intensities.
+    """
 
     points: Float
     directions: Float
     residual: Float
+    range_bias: Float | float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +94,8 @@ def find_partners(
         own = source.sample_intensity[::stride][chosen]
         color = _color_rows(p[chosen], own, texture, off_px[good], *target.intrinsics[:2])
     share = float(good.mean()) if len(good) else 0.0
-    return Partners(Rows(p[chosen], n[good], r[good]), color, share, len(source.sample[::stride]))
+    bias = RANGE_BIAS_1_M * np.abs(source.sample[::stride][chosen, 2] ** 2 - there[good, 2] ** 2)
+    return Partners(Rows(p[chosen], n[good], r[good], bias), color, share, len(source.sample[::stride]))
 
 
 @dataclass(frozen=True)
@@ -145,14 +153,14 @@ def _color_rows(p: Float, intensity: Float, texture: Float, off_px: Float, fx: f
 
 
 def shape_weights(rows: Rows) -> Float:
-    """Weights (N,), m-2: 1/z⁴ for depth noise, times a Cauchy factor at twice the residuals' spread."""
+    """Weights (N,), m-2: 1/z⁴ for depth noise, less where ranges differ, times a Cauchy factor at twice the spread."""
     noise = rows.points[:, 2] ** 2
-    return _robust(rows.residual / noise, NOISE_FLOOR_M) / noise**2
+    return _robust(rows.residual / noise, NOISE_FLOOR_M, rows.range_bias / noise) / noise**2
 
 
-def _robust(r: Float, floor: float) -> Float:
-    """1/σ² times the Cauchy factor, σ from the residuals' own median."""
-    sigma = max(mad_sigma(r), floor)
+def _robust(r: Float, floor: float, bias: Float | float = 0.0) -> Float:
+    """1/σ² times the Cauchy factor, σ from the residuals' own median, and from a bias where they have one."""
+    sigma = np.hypot(max(mad_sigma(r), floor), bias)
     return np.asarray(1 / ((1 + (r / (2 * sigma)) ** 2) * sigma**2))
 
 
