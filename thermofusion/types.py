@@ -159,11 +159,14 @@ class LensScatter:
     """Light that a lens spreads widely (see `physics.scatter`).
 
     parts : (share of the light, one sigma of the Gaussian that it is spread over [image widths]) each. sigma : one
-    sigma of the whole share.
+    sigma of the whole share. stated : the lens was measured by itself. differs : share by which the halo of the scan
+    differs from what was stated, 0 = not beyond doubt.
     """
 
     parts: tuple[tuple[float, float], ...]
     sigma: float
+    stated: bool = False
+    differs: float = 0.0
 
     @property
     def share(self) -> float:
@@ -186,7 +189,8 @@ class ThermalCamera:
     lens : pinhole and distortion. T_thermal_depth : (4, 4). band_um : wavelengths it sees. netd_K : noise of a pixel,
     one sigma. time_offset_s : added to a thermal frame's own time to get the depth clock's. psf_sigma_px : optical and
     pixel point spread; None = not measured. mount : `free` = not on the depth camera's rig: T_thermal_depth and
-    time_offset_s then mean nothing. Raises ValueError for a transform that is not rigid.
+    time_offset_s then mean nothing. scatter : light that the lens spreads widely; None = not measured. Raises
+    ValueError for a transform that is not rigid.
     """
 
     lens: Camera
@@ -197,6 +201,7 @@ class ThermalCamera:
     time_offset_s: float = 0.0
     psf_sigma_px: float | None = None
     mount: Literal["rig", "free"] = "rig"
+    scatter: LensScatter | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_thermal_depth", check_rigid(self.T_thermal_depth, "T_thermal_depth"))

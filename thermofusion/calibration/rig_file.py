@@ -16,7 +16,8 @@ from ..files.strict import validated
 from ..files.whole import write_text
 from ..scans.common import make_rig
 from ..scans.native.schema import STREAMS, RigDoc, RigExtrinsicsDoc, camera_of, matrix_of
-from ..types import Camera, Float, Rig, SignalCurve
+from ..scans.native.write import scatter_document
+from ..types import Camera, Float, LensScatter, Rig, SignalCurve
 from .fit.cameras import INTRINSIC_NAMES
 from .fit.depth_model import DisparityDepth
 from .fit.rig import Calibration
@@ -52,15 +53,19 @@ def rig_document(
     date: str | None = None,
     curve: SignalCurve | None = None,
     time_offset_s: float | None = None,
+    scatter: LensScatter | None = None,
     advice: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """The JSON document. date : ISO 8601, the caller's. curve, time_offset_s : of the thermal camera, if known."""
+    """The JSON document. date : ISO 8601, the caller's. curve, time_offset_s, scatter : of the thermal camera, if
+    known."""
     fit = calibration.fit
     cameras = {name: _camera_doc(c) for name, c in sorted(calibration.cameras.items())}
     if curve is not None and "thermal" in cameras:
         cameras["thermal"]["signal"] = signal_document(curve)
     if time_offset_s is not None and "thermal" in cameras:
         cameras["thermal"]["time_offset_s"] = time_offset_s
+    if scatter is not None and "thermal" in cameras:
+        cameras["thermal"]["scatter"] = scatter_document(scatter)
     covariances = {k: v.tolist() for k, v in calibration.extrinsic_covariance.items()}
     covariances |= {c: fit.block_covariance(c).tolist() for c in cameras}
     return {
@@ -129,6 +134,16 @@ def read_rig(path: Path) -> RigFile:
     extrinsics = {k: matrix_of(r, f"extrinsics.{k}", path) for k, r in rows.items() if r is not None}
     covariances = {name: _square(r, f"covariances.{name}", path) for name, r in doc.covariances.items()}
     return RigFile(cameras, extrinsics, covariances, tree)
+
+
+def add_scatter(path: Path, scatter: LensScatter) -> None:
+    """Write the lens's scatter into a rig.json, all else as it is. Raises ScanError: no rig, no thermal camera."""
+    read_rig(path)
+    tree = read_json(path, "rig")
+    if tree["cameras"].get("thermal") is None:
+        raise ScanError("the rig has no thermal camera", place=path, hint="give the rig.json of the camera's own rig")
+    tree["cameras"]["thermal"]["scatter"] = scatter_document(scatter)
+    write_rig(path, tree)
 
 
 def _square(rows: list[list[float]], key: str, path: Path) -> Float:

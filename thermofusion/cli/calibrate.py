@@ -32,6 +32,9 @@ class Besides:
     time_offset_s: Annotated[
         float | None, typer.Option("--time-offset-s", min=-3600, max=3600, help="Of `thermal time-offset`.")
     ] = None
+    scatter: Annotated[Path | None, typer.Option(help="scatter.json of `thermal scatter`: what the lens spreads.")] = (
+        None
+    )
 
 
 @spelled_out
@@ -50,6 +53,7 @@ def calibrate(
     from ..calibration import calibrate as solve
     from ..calibration import report_html, rig_document, write_rig
     from ..calibration.thermal.blackbody import read_curve
+    from ..calibration.thermal.scatter import read_scatter
     from ..files.whole import write_text
 
     day, radiometry = _day(besides.date), None if besides.curve is None else read_curve(besides.curve)
@@ -60,6 +64,7 @@ def calibrate(
         date=day or done.folder.newest.isoformat(),
         curve=None if radiometry is None else radiometry.signal_curve(),
         time_offset_s=besides.time_offset_s,
+        scatter=None if besides.scatter is None else read_scatter(besides.scatter),
         advice=done.advice,
     )
     if radiometry is not None:

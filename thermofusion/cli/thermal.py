@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -31,10 +32,11 @@ Raw = Annotated[
 ]
 
 FIELD_MARGIN = 0.1  # of the curve's range: vignetting and noise about a source at its end
+DEFAULT_BAND_UM = (7.5, 13.5)  # where no recording states the camera's
 STILL_SHARE = 0.02  # of a picture may move in a still recording
 
 verbs = typer.Typer(
-    help="The thermal camera by itself: curve, field, flatten, noise, edge, time-offset.",
+    help="The thermal camera by itself: curve, field, flatten, noise, edge, scatter, time-offset.",
     invoke_without_command=True,
     callback=help_alone,
 )
@@ -213,6 +215,8 @@ def edge(
 ) -> None:
     """Point spread from a straight, slightly slanted hot edge (the mean of all frames)."""
     from ..calibration.thermal.noise import edge_spread
+    from ..calibration.thermal.scatter import measure_scatter
+    from ..physics.band import Band
 
     part = None if box is None else _box(box)
     image, unit = _opener(raw)(source).mean_shown(_curve(curve))
@@ -220,11 +224,62 @@ def edge(
         found = edge_spread(image if part is None else part.cut(image))
     except ScanError as e:
         raise ScanError(e.cause, place=source, hint=e.hint) from None
+    wide = None
+    if unit == "degC":
+        with suppress(ScanError):  # the rest of the picture need not be an even wall
+            wide = measure_scatter([image], Band(*DEFAULT_BAND_UM)).scatter
     text = (
         f"point spread {found.sigma_px:.3f} ± {found.sigma_sigma_px:.3f} px, one sigma (psf_sigma_px in scan.json)\n"
         f"edge {found.contrast:.1f} {'K' if unit == 'degC' else unit} high, slanted by {found.angle_deg:+.1f}°"
     )
-    emit({**vars(found), "contrast_unit": unit}, text, json)
+    if wide is not None:
+        text += f"\nspread wider: {100 * wide.share:.2f} ± {100 * wide.sigma:.2f} % of the light (see thermal scatter)"
+    spread = {f"scatter_{name}": None if wide is None else getattr(wide, name) for name in ("share", "sigma")}
+    emit({**vars(found), "contrast_unit": unit, **spread}, text, json)
+
+
+@verbs.command()
+def scatter(
+    sources: Annotated[
+        list[Path],
+        typer.Argument(help="Recordings or pictures of something hot before an even wall, one for each place of it."),
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Scatter file to write.", callback=spared_file)] = Path(
+        "scatter.json"
+    ),
+    rig: Annotated[Path | None, typer.Option(help="rig.json of this camera: the kernel is written there, too.")] = None,
+    curve: Curve = None,
+    raw: Raw = None,
+    json: Json = False,
+) -> None:
+    """How much light the lens spreads over tens of pixels (the mean of all frames of each source)."""
+    from ..calibration.rig_file import add_scatter
+    from ..calibration.thermal.scatter import measure_scatter, scatter_document
+    from ..files.json import to_json
+    from ..files.whole import write_text
+    from ..physics.band import Band
+
+    opened, chosen = [_opener(raw)(s) for s in sources], _curve(curve)
+    cameras = [s.scan.thermal.camera for s in opened if s.scan is not None and s.scan.thermal is not None]
+    try:
+        pictures = [s.mean_degC(chosen) for s in opened]
+        found = measure_scatter(pictures, Band(*(cameras[0].band_um if cameras else DEFAULT_BAND_UM)))
+    except ScanError as e:
+        raise ScanError(e.cause, place=e.place or sources[0], hint=e.hint) from None
+    document = scatter_document(found)
+    if rig is not None:
+        add_scatter(rig, found.scatter)
+    write_text(out, to_json(document) + "\n")
+    g, wrote = found.scatter, f"{out} and {rig}" if rig is not None else str(out)
+    kernel = ", ".join(f"{100 * share:.2f} % over {width:.1%}" for share, width in g.parts)
+    beyond = ", ".join(f"{100 * share:.2f} % beyond {r} px" for r, share in found.beyond.items())
+    text = (
+        f"scatter  {100 * g.share:.2f} ± {100 * g.sigma:.2f} % of the light, one sigma (scatter in scan.json)\n"
+        f"kernel   {kernel} of the image's width: {beyond}\n"
+        f"from     {counted(found.pictures, 'picture')}, {found.contrast_K:.1f} K above the room\n"
+        f"assumed  beyond the picture it is as at its border, or as the room: ± {100 * found.unseen:.2f} % of the sigma"
+    )
+    emit(document, f"{text}\nwrote {wrote}", json)
 
 
 @verbs.command("time-offset")

@@ -27,6 +27,7 @@ VOCABULARY = MappingProxyType(
         "readings agree by place in the image": "record more views in which the same skin crosses the whole image",
         "reflected temperature stated wrong": "measure it with crumpled foil where the person stood, or leave it out",
         "lens scatters light": "clean the lens, and keep hot things out of the picture's surroundings",
+        "lens scatters other than stated": "clean the lens, and measure it again with `thermal scatter`",
         "surface that is not skin": "take off what can be taken off; its temperature is not the skin's",
         "dead pixels": "have the camera's list of bad pixels renewed",
         "depth scale is off": "measure something of known size with the depth camera, and the spacing of the cameras",

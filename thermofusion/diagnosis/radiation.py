@@ -8,8 +8,16 @@ from .words import Diagnosis
 
 
 def of_lens(scatter: LensScatter | None) -> list[Diagnosis]:
-    """Light that the lens spreads, where it was found in the scan."""
-    if scatter is None or not scatter.share:
+    """Light that the lens spreads, where it was found in the scan, or differs from what was stated of the lens."""
+    if scatter is not None and scatter.differs:
+        seen = 100 * (scatter.share + scatter.differs)
+        text = (
+            f"the halo that goes with the subject is {seen:.1f} % of the light, {100 * scatter.share:.1f} % are stated"
+        )
+        done = "what is stated was taken off; the difference is in sigma"
+        size = abs(100 * scatter.differs)
+        return [Diagnosis("lens scatters other than stated", text, None, "whole image", done, size=size, unit="%")]
+    if scatter is None or scatter.stated or not scatter.share:
         return []
     percent = 100 * scatter.share
     width = sum(g * w for g, w in scatter.parts) / scatter.share

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..geometry.camera import pixel_rays
 from ..geometry.rays import RayScene, rays_from
-from ..physics.scatter import blurred
+from ..physics.scatter import WIDTHS, blurred, on_widths
 from ..physics.signal import SignalConverter
 from ..robust import evenly
 from ..types import (
@@ -40,7 +40,6 @@ CLEAR_BLOCKS = 1.5  # from the outline, beyond which a block counts: point sprea
 WARM_SHARE = 0.3  # of the way from room to skin: blocks beyond it, side by side with the subject, belong to it
 SOURCE_BLOCKS = 2  # about a blackbody that are left out
 LEAST_NOISE = 0.05  # of NETD: pixels of a block that differ by less were not read from a sensor
-SPREADS = (0.02, 0.035, 0.06, 0.1, 0.17)  # one sigma of the blurs that scatter is made of, image widths
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +48,7 @@ class Background:
 
     view : (N,) row of the thermal views. direction : (N, 3) unit, world, from the camera into the room. radiance : (N,)
     mean over a block as the camera reports it, W m-2 sr-1. spread : (N, K) the same of the whole picture blurred with
-    one sigma of `SPREADS` image widths. u_px, v_px : (N,) a block's middle. n_views : that were looked at; block_px :
+    one sigma of `WIDTHS` image widths. u_px, v_px : (N,) a block's middle. n_views : that were looked at; block_px :
     side of a block, px.
     """
 
@@ -68,9 +67,8 @@ class Background:
         return len(self.view)
 
     def without(self, scatter: LensScatter) -> Background:
-        """With what the lens spread onto it taken off. scatter : of widths that `SPREADS` names."""
-        share = {w: g for g, w in scatter.parts}
-        g = np.array([share.get(w, 0.0) for w in SPREADS], np.float32)
+        """With what the lens spread onto it taken off."""
+        g = on_widths(scatter).astype(np.float32)
         return replace(self, radiance=self.radiance * (1 + g.sum()) - self.spread @ g)
 
 
@@ -102,7 +100,7 @@ class BackgroundFinder:
         return {
             "direction": direction[free],
             "radiance": mean[free],
-            "spread": np.stack([blurred(whole, s * self.shape[1])[free] for s in SPREADS], axis=1),
+            "spread": np.stack([blurred(whole, s * self.shape[1])[free] for s in WIDTHS], axis=1),
             "u_px": self.u_px[free],
             "v_px": self.v_px[free],
         }

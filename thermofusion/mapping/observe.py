@@ -44,7 +44,7 @@ from .background import Background, find_background
 from .corrections import MotionResult, view_corrections
 from .pixels import bad_pixels
 from .references import BlackbodyReading, read_blackbodies
-from .scatter import estimate_scatter, spread_on
+from .scatter import check_scatter, estimate_scatter, spread_on
 from .views import thermal_views
 
 EDGE_CAP_PX = 32.0  # distances to a silhouette are stored up to here; nothing depends on larger ones
@@ -177,7 +177,11 @@ def observe(
     if bad.any():
         converter = SignalConverter(stream.camera, bad)
     background = find_background(stream, surface, views, converter, scan.references)
-    scatter = estimate_scatter(background, stream.camera.lens, converter.band)
+    lens, stated = stream.camera.lens, stream.camera.scatter
+    if stated is None:
+        scatter = estimate_scatter(background, lens, converter.band)
+    else:
+        scatter = check_scatter(background, lens, converter.band, stated)
     if scatter.share:
         converter, background = SignalConverter(stream.camera, bad, scatter), background.without(scatter)
     observations = observe_views(stream, SurfaceRays(surface, body), views, converter, mapping, progress=progress)

@@ -7,21 +7,20 @@ Room and field are of order 2, a cell of 10° may differ: a warm wall stays wher
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
-from scipy.optimize import nnls
 from scipy.sparse import csr_matrix
 
 from ..geometry.sphere import cell_of, harmonics
 from ..physics.band import Band
-from ..physics.scatter import halo, reduced
+from ..physics.scatter import WIDTHS, HaloNormal, halo, on_widths, reduced
 from ..physics.signal import SignalConverter
 from ..robust import MAD_PER_SIGMA, TUKEY, evenly, tukey_weight
 from ..types import Camera, Float, Float32, LensScatter, Observations, ThermalStream, ThermalViews
-from .background import SPREADS, Background
+from .background import Background
 
 ROWS = 30_000  # blocks of background that are asked, evenly
 LEAST_ROWS, LEAST_VIEWS = 3000, 8
@@ -36,26 +35,6 @@ SPREAD_VIEWS = 20  # that the effect on vertices is averaged over
 UNKNOWN_SIGMA, UNKNOWN_WIDTH = 0.005, 0.1  # one sigma of the share where no background shows it; image widths
 
 
-@dataclass(frozen=True, eq=False)
-class _Normal:
-    """Normal equations of some views: N (P, P), rhs (P,); the K shares first."""
-
-    N: Float
-    rhs: Float
-
-    def less(self, other: _Normal) -> _Normal:
-        return _Normal(self.N - other.N, self.rhs - other.rhs)
-
-    def shares(self, prior: Float, K: int) -> Float:
-        """(K,) g >= 0 of least cost, all else eliminated; prior (P,): inverse variances."""
-        N = self.N + np.diag(prior)
-        inverse = cho_factor(N[K:, K:])
-        S = N[:K, :K] - N[:K, K:] @ cho_solve(inverse, N[K:, :K])
-        q = self.rhs[:K] - N[:K, K:] @ cho_solve(inverse, self.rhs[K:])
-        root = np.linalg.cholesky(S)
-        return np.asarray(nnls(root.T, np.linalg.solve(root, q))[0])
-
-
 def unknown_scatter() -> LensScatter:
     """None is known of, and some may be there."""
     return LensScatter(((0.0, UNKNOWN_WIDTH),), UNKNOWN_SIGMA)
@@ -63,28 +42,50 @@ def unknown_scatter() -> LensScatter:
 
 def estimate_scatter(background: Background, lens: Camera, band: Band) -> LensScatter:
     """The lens's scatter with its sigma; share 0 where the background shows none."""
-    views = np.unique(background.view)
-    if len(background) < LEAST_ROWS or len(views) < LEAST_VIEWS:
+    asked = _asked(background, lens, band)
+    if asked is None:
         return unknown_scatter()
-    image_px = lens.width_px, lens.height_px
-    slope_L = float(band.d_radiance_dT(band.temperature_K(float(np.median(background.radiance)))))
-    rows = np.arange(0, len(background), max(1, -(-len(background) // ROWS)))
-    parts, prior = _normals(background, rows, image_px, slope_L)
-    K = len(SPREADS)
-    whole = _Normal(np.sum([p.N for p in parts], axis=0), np.sum([p.rhs for p in parts], axis=0))
-    shares = whole.shares(prior, K)
-    left_out = np.array([whole.less(p).shares(prior, K).sum() for p in parts])
-    jackknife = float(np.sqrt((FOLDS - 1) / FOLDS * ((left_out - left_out.mean()) ** 2).sum()))
+    shares, sigma, jackknife = _solved(*asked, np.eye(len(WIDTHS)))
     share = float(shares.sum())
-    sigma = float(np.sqrt(jackknife**2 + MODEL_SIGMA**2 + (MODEL_SHARE * share) ** 2))
     if share < max(LEAST_SHARE, LEAST_SIGMAS * jackknife):
         return LensScatter(((0.0, UNKNOWN_WIDTH),), sigma)
-    return LensScatter(tuple((float(g), w) for g, w in zip(shares, SPREADS, strict=True) if g > 0), sigma)
+    return LensScatter(tuple((float(g), w) for g, w in zip(shares, WIDTHS, strict=True) if g > 0), sigma)
+
+
+def check_scatter(background: Background, lens: Camera, band: Band, stated: LensScatter) -> LensScatter:
+    """The scatter that was measured of the lens by itself; where the halo in the scan is beyond doubt another one of
+    that shape, what it differs by, in sigma too."""
+    asked = _asked(background, lens, band)
+    if asked is None:
+        return stated
+    shares, sigma, _ = _solved(*asked, on_widths(stated.unit)[:, None])
+    differs = float(shares.sum()) - stated.share
+    if abs(differs) < LEAST_SIGMAS * np.hypot(sigma, stated.sigma):
+        return stated
+    return replace(stated, sigma=float(np.hypot(stated.sigma, differs)), differs=differs)
+
+
+def _asked(background: Background, lens: Camera, band: Band) -> tuple[list[HaloNormal], Float] | None:
+    """Normal equations by block of views and the prior; None where too little background is seen."""
+    if len(background) < LEAST_ROWS or len(np.unique(background.view)) < LEAST_VIEWS:
+        return None
+    slope_L = float(band.d_radiance_dT(band.temperature_K(float(np.median(background.radiance)))))
+    rows = np.arange(0, len(background), max(1, -(-len(background) // ROWS)))
+    return _normals(background, rows, (lens.width_px, lens.height_px), slope_L)
+
+
+def _solved(parts: list[HaloNormal], prior: Float, shapes: Float) -> tuple[Float, float, float]:
+    """Shares of shapes (K, S) on `WIDTHS`, (S,); one sigma of their sum, and of it what views left out tell."""
+    whole = HaloNormal(np.sum([p.N for p in parts], axis=0), np.sum([p.rhs for p in parts], axis=0))
+    shares = whole.shares(prior, shapes)
+    left_out = np.array([whole.less(p).shares(prior, shapes).sum() for p in parts])
+    jackknife = float(np.sqrt((FOLDS - 1) / FOLDS * ((left_out - left_out.mean()) ** 2).sum()))
+    return shares, float(np.sqrt(jackknife**2 + MODEL_SIGMA**2 + (MODEL_SHARE * shares.sum()) ** 2)), jackknife
 
 
 def _normals(
     background: Background, rows: NDArray, image_px: tuple[int, int], slope_L: float
-) -> tuple[list[_Normal], Float]:
+) -> tuple[list[HaloNormal], Float]:
     """Normal equations by block of views, and the prior's inverse variances (P,)."""
     direction, view = background.direction[rows].astype(np.float64), background.view[rows]
     _, view = np.unique(view, return_inverse=True)
@@ -99,7 +100,7 @@ def _normals(
     value = np.column_stack([design, np.ones((R, 2))])
     A = csr_matrix((value.ravel(), index.ravel(), np.arange(0, R * (n + 2) + 1, n + 2)), shape=(R, n + M + C))
     y = y - np.median(y)
-    K = len(SPREADS)
+    K = len(WIDTHS)
     wide, texture = (WIDE_K * slope_L) ** -2, (CELL_K * slope_L) ** -2
     prior = np.concatenate([np.zeros(K), np.full(n - K + M, wide), np.full(C, texture)])
     weak = np.concatenate([np.ones(K), np.zeros(len(prior) - K)])
@@ -115,7 +116,7 @@ def _normals(
     for fold in range(FOLDS):
         mine = np.flatnonzero(block == fold)
         a = A[mine]
-        parts.append(_Normal((a.T @ a.multiply(w[mine, None]).tocsr()).toarray(), a.T @ (w[mine] * y[mine])))
+        parts.append(HaloNormal((a.T @ a.multiply(w[mine, None]).tocsr()).toarray(), a.T @ (w[mine] * y[mine])))
     return parts, prior
 
 

@@ -7,13 +7,54 @@ What stands beyond the picture is not known: its border is taken to go on.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import nnls
 
 from ..types import Float32, LensScatter
 
+WIDTHS = (0.02, 0.035, 0.06, 0.1, 0.17)  # one sigma of the Gaussians that an unknown kernel is made of, image widths
 COARSE_ACROSS = 80  # pixels of the reduced picture that is blurred: 8 px of 640
+
+
+def on_widths(scatter: LensScatter) -> NDArray[np.float64]:
+    """(K,) shares on `WIDTHS` with the same light and second moment; beyond their ends the nearest takes all."""
+    squares = np.square(WIDTHS)
+    out = np.zeros(len(WIDTHS))
+    for share, width in scatter.parts:
+        at = np.interp(width**2, squares, np.arange(len(WIDTHS)))
+        low = int(np.floor(at))
+        out[low] += share * (1 - (at - low))
+        out[min(low + 1, len(WIDTHS) - 1)] += share * (at - low)
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class HaloNormal:
+    """Normal equations of some readings of background beside something warm: N (P, P), rhs (P,); the shares of
+    `WIDTHS` first, then whatever else is not known."""
+
+    N: NDArray[np.float64]
+    rhs: NDArray[np.float64]
+
+    def less(self, other: HaloNormal) -> HaloNormal:
+        """Without some of the readings."""
+        return HaloNormal(self.N - other.N, self.rhs - other.rhs)
+
+    def shares(self, prior: NDArray, shapes: NDArray) -> NDArray[np.float64]:
+        """(S,) g >= 0 of shapes (K, S) on `WIDTHS` that cost least, all else eliminated; prior (P,): inverse
+        variances."""
+        K = len(WIDTHS)
+        N = self.N + np.diag(prior)
+        inverse = cho_factor(N[K:, K:])
+        S = shapes.T @ (N[:K, :K] - N[:K, K:] @ cho_solve(inverse, N[K:, :K])) @ shapes
+        q = shapes.T @ (self.rhs[:K] - N[:K, K:] @ cho_solve(inverse, self.rhs[K:]))
+        root = np.linalg.cholesky(S)
+        return np.asarray(nnls(root.T, np.linalg.solve(root, q))[0])
 
 
 def reduced(radiance: Float32) -> Float32:

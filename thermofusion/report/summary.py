@@ -14,7 +14,7 @@ from ..errors import counted
 from ..export.palettes import beyond_range
 from ..geometry.rigid import invert, rotation_angle_deg
 from ..recipe import Recipe
-from ..types import Scan, VertexFlag
+from ..types import LensScatter, Scan, VertexFlag
 from ..version import __version__
 from .metadata import radiometric_numbers, stated
 
@@ -271,12 +271,16 @@ def _mapping(m: Mapped) -> dict[str, Any]:
         "left_out": m.left_out,
         "observations": len(m.observations),
         "blackbody_readings": len(m.blackbodies),
-        "scatter": None if m.scatter is None else {"share": m.scatter.share, "sigma": m.scatter.sigma},
+        "scatter": None if m.scatter is None else _scatter(m.scatter),
     }
     if m.motion is None:
         return out
     motion = {k: getattr(m.motion, k) for k in ("kept", "residual_px_before", "residual_px_after", "correction_mm")}
     return {**out, "motion": motion}
+
+
+def _scatter(s: LensScatter) -> dict[str, Any]:
+    return {"share": s.share, "sigma": s.sigma, "stated": s.stated, "differs": s.differs}
 
 
 def _temperature(t: Temperature) -> dict[str, Any]:

@@ -57,12 +57,14 @@ def _of_types() -> dict[str, type]:
     return {
         "budget-input/1": BudgetInput,
         "camera/1": Camera,
-        "lens-scatter/1": LensScatter,
+        "lens-scatter/2": LensScatter,
+        "lens-scatter/1": LensScatter,  # without `stated`
         "observations/1": Observations,
         "shared-errors/1": SharedErrors,
         "signal-curve/1": SignalCurve,
         "surface-mesh/1": SurfaceMesh,
-        "thermal-camera/2": ThermalCamera,
+        "thermal-camera/3": ThermalCamera,
+        "thermal-camera/2": ThermalCamera,  # without `scatter`
         "thermal-camera/1": ThermalCamera,  # without `mount`
         "thermal-mesh/2": ThermalMesh,
         "thermal-mesh/1": ThermalMesh,  # without `residual`

@@ -12,7 +12,16 @@ from pydantic import BaseModel, Field, field_validator
 from ...errors import ScanError
 from ...files.reading import read_json
 from ...files.strict import Border, validated
-from ...types import BlackbodyReference, Camera, ContactReference, Reference, Rig, SignalCurve, ThermalCamera
+from ...types import (
+    BlackbodyReference,
+    Camera,
+    ContactReference,
+    LensScatter,
+    Reference,
+    Rig,
+    SignalCurve,
+    ThermalCamera,
+)
 from ..common import Kind, make_camera, make_rig
 
 SCHEMA = "thermofusion-scan/1"
@@ -76,6 +85,24 @@ class DepthCameraDoc(CameraDoc):
         return up
 
 
+class ScatterPartDoc(Border):
+    """A share of the light, and one sigma of the Gaussian that it is spread over, in image widths."""
+
+    share: float = Field(ge=0, le=0.2)
+    width: float = Field(ge=0.005, le=1)
+
+
+class ScatterDoc(Border):
+    """`scatter`: light that the lens spreads widely, as `thermal scatter` measures it; sigma of the whole share."""
+
+    parts: list[ScatterPartDoc] = Field(min_length=1, max_length=10)
+    sigma: float = Field(ge=0, le=0.2)
+
+    def lens_scatter(self) -> LensScatter:
+        """As the package's type."""
+        return LensScatter(tuple((p.share, p.width) for p in self.parts), self.sigma, stated=True)
+
+
 class ThermalCameraDoc(CameraDoc):
     """The thermal camera."""
 
@@ -85,6 +112,7 @@ class ThermalCameraDoc(CameraDoc):
     time_offset_s: float = Field(0.0, ge=-1e11, le=1e11)  # s: clocks may begin anywhere
     psf_sigma_px: float | None = Field(None, ge=0.01, le=20)
     mount: Literal["rig", "free"] = "rig"  # free: held by itself, or on a stand; it has no extrinsic
+    scatter: ScatterDoc | None = None
 
 
 class CamerasDoc(Border):
@@ -250,7 +278,8 @@ def thermal_camera_of(doc: ThermalCameraDoc, extrinsics: ExtrinsicsDoc, path: Pa
     T = np.eye(4) if doc.mount == "free" else _extrinsic(extrinsics, "thermal", path)
     signal = SignalCurve() if doc.signal is None else signal_of(doc.signal, path)
     try:
-        return ThermalCamera(lens, T, signal, doc.band_um, doc.netd_K, doc.time_offset_s, doc.psf_sigma_px, doc.mount)
+        own = signal, doc.band_um, doc.netd_K, doc.time_offset_s, doc.psf_sigma_px, doc.mount
+        return ThermalCamera(lens, T, *own, None if doc.scatter is None else doc.scatter.lens_scatter())
     except ValueError as e:
         raise ScanError(str(e), place=f"{path}: key 'extrinsics'") from None
 

@@ -20,7 +20,7 @@ from ...files.reading import PNG_MAGIC, decode_image, read_bytes
 from ...files.tum import write_trajectory
 from ...files.whole import replacing_folder
 from ...progress import Progress, silent
-from ...types import BlackbodyReference, Camera, Reference, Scan, Stream, ThermalCamera, Trajectory
+from ...types import BlackbodyReference, Camera, LensScatter, Reference, Scan, Stream, ThermalCamera, Trajectory
 from ..common import Kind, as_loaded, as_thermal
 from .schema import SCHEMA, STREAMS
 
@@ -106,7 +106,13 @@ def _radiometry(camera: ThermalCamera) -> dict[str, Any]:
         "time_offset_s": camera.time_offset_s,
         **({} if camera.psf_sigma_px is None else {"psf_sigma_px": camera.psf_sigma_px}),
         **({} if camera.mount == "rig" else {"mount": camera.mount}),
+        **({} if camera.scatter is None else {"scatter": scatter_document(camera.scatter)}),
     }
+
+
+def scatter_document(scatter: LensScatter) -> dict[str, Any]:
+    """`scatter` of a thermal camera."""
+    return {"parts": [{"share": g, "width": w} for g, w in scatter.parts], "sigma": scatter.sigma}
 
 
 def _reference(r: Reference) -> dict[str, Any]:
