@@ -36,7 +36,7 @@ DEFAULT_BAND_UM = (7.5, 13.5)  # where no recording states the camera's
 STILL_SHARE = 0.02  # of a picture may move in a still recording
 
 verbs = typer.Typer(
-    help="The thermal camera by itself: curve, field, flatten, noise, edge, scatter, time-offset.",
+    help="The thermal camera by itself: curve, field, flatten, noise, edge, scatter, qualify, time-offset.",
     invoke_without_command=True,
     callback=help_alone,
 )
@@ -280,6 +280,46 @@ def scatter(
         f"assumed  beyond the picture it is as at its border, or as the room: ± {100 * found.unseen:.2f} % of the sigma"
     )
     emit(document, f"{text}\nwrote {wrote}", json)
+
+
+@verbs.command()
+def qualify(
+    readings: Readings,
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="Figures to write: .json, and a page beside it.", callback=spared_file)
+    ] = Path("qualify.json"),
+    sigma: Annotated[float, typer.Option("--sigma-K", min=0, max=10, help="Of the sources, one sigma.")] = 0.03,
+    curve: Curve = None,
+    rate: Annotated[float | None, typer.Option(min=1e-3, help="Frames a second, where they state no times.")] = None,
+    raw: Raw = None,
+    json: Json = False,
+) -> None:
+    """Accuracy, stability, drift, uniformity, repeatability, NETD, resolvable difference; no claim of conformity."""
+    from ..calibration.thermal.blackbody import read_readings, shown_sources
+    from ..calibration.thermal.qualify import qualify as figures
+    from ..calibration.thermal.qualify_page import CLAIM, qualify_page
+    from ..files.json import to_json
+    from ..files.whole import write_text
+
+    if out.suffix != ".json":
+        raise RecipeError(f"figures are written as .json, not '{out.suffix}'", place=out)
+    groups = shown_sources(read_readings(readings), readings, _opener(raw, rate), _curve(curve))
+    try:
+        found = figures(groups, sigma)
+    except ScanError as e:
+        raise ScanError(e.cause, place=e.place or readings, hint=e.hint) from None
+    document = {"schema": "thermofusion-qualify/1", "claim": CLAIM, **vars(found)}
+    write_text(out, to_json(document) + "\n")
+    write_text(out.with_suffix(".html"), qualify_page(found))
+    areas = ", ".join(f"{1e3 * v:.0f} mK ({side} x {side} px)" for side, v in found.resolvable_K.items())
+    text = (
+        f"accuracy       {found.accuracy_K:+.3f} K at most; the sources' own sigma {found.accuracy_sigma_K:.3f} K\n"
+        f"drift          {found.drift_K_per_min:+.3f} K/min; stability about it {1e3 * found.stability_K:.1f} mK\n"
+        f"uniformity     {1e3 * found.uniformity_K:.1f} mK; NETD {1e3 * found.netd_K:.1f} mK\n"
+        f"repeatability  {1e3 * found.repeatability_K:.1f} mK, {found.repeatability_freedom} degrees of freedom\n"
+        f"resolvable     {areas}\n{CLAIM}"
+    )
+    emit(document, f"{text}\nwrote {out} and {out.with_suffix('.html')}", json)
 
 
 @verbs.command("time-offset")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -18,8 +18,9 @@ from ...files.strict import Border, validated
 from ...files.table import table_rows
 from ...files.whole import replacing, write_text
 from ...scans.native.schema import Constant, SignalDoc
-from ...types import Float, SignalCurve
+from ...types import Bool, Float, SignalCurve
 from ...version import __version__
+from .qualify import Shown
 from .radiometric import PixelField, RadiometricCurve, check_monotone
 from .source import ThermalSource
 
@@ -95,6 +96,36 @@ def _median_counts(reading: Reading, opener: Opener) -> float:
     mean = opener(reading.file).mean_counts()
     part = mean if reading.box is None else reading.box.cut(mean, reading.place)
     return float(np.median(part))
+
+
+def shown_sources(
+    readings: list[Reading], path: Path, opener: Opener, curve: RadiometricCurve | None
+) -> list[list[Shown]]:
+    """Recordings of sources, each a list of those in it, in the table's order. Raises ScanError naming the line."""
+    groups: dict[Path, list[Shown]] = {}
+    for r in readings:
+        if r.file is None:
+            raise ScanError("a qualification needs recordings: rows file,degC", place=r.place)
+        source = opener(r.file)
+        name = f"{r.file.name}, {r.degC:g} °C"
+        groups.setdefault(r.file, []).append(
+            Shown(name, r.degC, _frames(source, r, curve), source.times_s, _after_shutter(source))
+        )
+    return list(groups.values())
+
+
+def _frames(source: ThermalSource, reading: Reading, curve: RadiometricCurve | None) -> Iterator[Float]:
+    for i in range(len(source)):
+        image = source.degC(i, curve)
+        yield image if reading.box is None else reading.box.cut(image, reading.place)
+
+
+def _after_shutter(source: ThermalSource) -> Bool:
+    """(N,) frames before which the recording marks the shutter."""
+    if source.scan is None or source.scan.thermal is None:
+        return np.zeros(len(source), bool)
+    kept = np.flatnonzero(source.scan.thermal.usable)
+    return np.concatenate([[False], np.diff(kept) > 1])
 
 
 # ---------------------------------------------------------------- files
