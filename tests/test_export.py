@@ -34,7 +34,7 @@ from thermofusion.export import (
     write_trajectory,
     write_vtp,
 )
-from thermofusion.export.columns import COLUMNS, vertex_normals
+from thermofusion.export.columns import COLUMNS, KNOWN, vertex_normals
 from thermofusion.export.palettes import apply, color_range, srgb_to_linear
 from thermofusion.files.whole import write_whole
 from thermofusion.geometry.rigid import pose
@@ -70,6 +70,21 @@ def test_lossless_round_trip(tmp_path, write, read):
         np.testing.assert_array_equal(back.uncertainty_parts[name], values)
     first = (tmp_path / "m").read_bytes()
     assert write(tmp_path / "again", mesh).read_bytes() == first  # same input, same bytes
+
+
+@pytest.mark.parametrize(("write", "read"), [(write_ply, read_ply), (write_vtp, read_vtp), (write_glb, read_glb)])
+def test_motion_travels_where_there_was_some(tmp_path, write, read):
+    mesh = result()
+    assert read(write(tmp_path / "still", mesh)).moved_mm is None
+    assert b"moved" not in (tmp_path / "still").read_bytes().lower()
+    moved_mm = np.linspace(0.0, 37.5, len(mesh), dtype=np.float32)
+    back = read(write(tmp_path / "moved", replace(mesh, moved_mm=moved_mm)))
+    order = np.argmin(np.linalg.norm(back.surface.vertices_m[:, None] - mesh.surface.vertices_m, axis=2), axis=1)
+    known = np.isfinite(back.moved_mm)  # glTF carries the measured skin's alone
+    assert known.sum() >= mesh.measured.sum()
+    np.testing.assert_array_equal(back.moved_mm[known], moved_mm[order][known])
+    write_csv(tmp_path / "m.csv", replace(mesh, moved_mm=moved_mm))
+    np.testing.assert_allclose(read_csv(tmp_path / "m.csv")["moved_mm"], moved_mm, atol=6e-5)
 
 
 def test_skin_colour_only_if_asked(tmp_path):
@@ -487,8 +502,8 @@ def test_documented_names_are_the_writers():
     text = DOCS.read_text(encoding="utf-8")
     rows = [re.findall(r"`([^`]+)`", line) for line in text.splitlines() if line.startswith("| `")]
     documented = {tuple(row[:3]) for row in rows if len(row) >= 3 and row[1].startswith("scalar_")}
-    assert documented == {(c.field, c.ply, c.glb) for c in COLUMNS}
-    for c in COLUMNS:
+    assert documented == {(c.field, c.ply, c.glb) for c in KNOWN}
+    for c in KNOWN:
         line = next(line for line in text.splitlines() if line.startswith(f"| `{c.field}`"))
         assert f"| {c.unit} |" in line
     for flag in VertexFlag:

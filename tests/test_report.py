@@ -38,7 +38,7 @@ def temperature():
     parts = {"noise": noise, "normals": noise, "registration": noise / 2, "air": noise / 3, "calibration": noise / 3}
     flags = mesh.flags | np.where((z > 0.08) & (x > 0.03), 64, 0).astype(np.uint8)  # not skin
     mesh = type(mesh)(**{**vars(mesh), "flags": flags, "temperature_degC": T, "apparent_degC": T - 0.5 - np.abs(x),
-                         "anchored": True, "uncertainty_parts": parts,
+                         "anchored": True, "uncertainty_parts": parts, "moved_mm": 20 * np.abs(x),
                          "observations": np.where(mesh.measured, 9, 0)})  # fmt: skip
     effects = {"reference": np.full(len(T), 0.03), "emissivity0": 0.02 + 0.01 * z, "calibration 1": 0.03 * x}
     shared = SharedErrors.of({k: np.where(mesh.measured, v, np.nan) for k, v in effects.items()}, 400.0, 0.025)
@@ -113,7 +113,7 @@ def test_picking_is_ray_casting_and_colours_are_the_legend_s(used, temperature):
 def test_maps_palettes_views_and_sides_show_something_of_their_own(used):
     _, seen = used
     assert {"temperature", "normal-equivalent", "apparent", "correction", "sigma", "angle", "count", "flag",
-            "color"} == set(seen["maps"])  # fmt: skip
+            "moved", "color"} == set(seen["maps"])  # fmt: skip
     assert all(seen["changes"].values()), seen["changes"]
     assert seen["same_again"]
     assert seen["cut"]["cut_z_m"] <= seen["cut"]["whole_z_m"] - 0.01  # the far side, seen through the cut

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 # A stage is handed exactly the recipe sections that its key holds. It also depends on all stages before it.
 STAGES = (
     Stage("tracking", ("input", "subject", "tracking")),
-    Stage("surface", ("input", "subject", "surface"), edition=3),
+    Stage("surface", ("input", "subject", "surface"), edition=4),
     Stage("rig", ("input", "rig"), edition=3),
     Stage("mapping", ("input", "mapping"), edition=9),
     Stage("temperature", ("mapping", "temperature"), edition=10, handed_out=RESULT),
@@ -159,7 +159,8 @@ class _Run:
         self.cast(Steps(tracking, surface))
         temperature = step("temperature", partial(solve, scan, mesh, mapped, normal_window_m=window_m))
         if temperature is not None:  # a finished result's stands in the result's frame
-            temperature = replace(temperature, mesh=replace(temperature.mesh, surface=mesh))
+            moved_mm = None if surface.motion is None else surface.motion.moved_mm
+            temperature = replace(temperature, mesh=replace(temperature.mesh, surface=mesh, moved_mm=moved_mm))
         return Steps(tracking, surface, rig, mapped, temperature)
 
     def step(self, name: str, compute: Computes) -> Any:

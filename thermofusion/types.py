@@ -508,7 +508,9 @@ class ThermalMesh:
     : one sigma of `temperature_degC`. view_angle_deg, distance_m : best (straightest) view's. observations : int32,
     thermal views that count. flags : uint8, bits of `VertexFlag`; UNMEASURED is set here wherever the temperature
     is NaN. uncertainty_parts : named parts of the budget, K, float32. residual : float32, rms of the views about a
-    vertex in sigmas of their own errors (1 = as expected, NaN = one view), or None where that is not known.
+    vertex in sigmas of their own errors (1 = as expected, NaN = one view), or None where that is not known. moved_mm :
+    float32, rms of each vertex's motion against the trunk while it was recorded, mm, or None for a subject that stood
+    still as far as can be told.
     metadata : frame, units, recipe, version, and `up` and `front` as "x y z" in the world frame (see
     `export.axes`). Raises ValueError on lengths or values that cannot be.
     """
@@ -526,6 +528,7 @@ class ThermalMesh:
     uncertainty_parts: dict[str, Float32] = field(default_factory=dict)
     metadata: dict[str, str | float] = field(default_factory=dict)
     residual: Float32 | None = None
+    moved_mm: Float32 | None = None
 
     def __post_init__(self) -> None:
         if self.mode not in get_args(OutputMode):
@@ -540,8 +543,9 @@ class ThermalMesh:
         object.__setattr__(self, "flags", flags | unmeasured)
         parts = {k: self._column(v, f"uncertainty_parts['{k}']", np.float32) for k, v in self.uncertainty_parts.items()}
         object.__setattr__(self, "uncertainty_parts", parts)
-        if self.residual is not None:
-            object.__setattr__(self, "residual", self._column(self.residual, "residual", np.float32))
+        for name in ("residual", "moved_mm"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, self._column(getattr(self, name), name, np.float32))
 
     def _column(self, values: object, name: str, dtype: DTypeLike) -> NDArray:
         try:
@@ -593,7 +597,7 @@ class ThermalMesh:
         """Name -> one value a vertex, (V,): the columns of docs/formats.md, in the units of their names."""
         names = ("temperature_degC", "apparent_degC", "uncertainty_K", "view_angle_deg", "distance_m")
         columns: dict[str, NDArray] = {n: getattr(self, n) for n in (*names, "observations", "flags")}
-        columns |= {} if self.residual is None else {"residual": self.residual}
+        columns |= {n: v for n in ("residual", "moved_mm") if (v := getattr(self, n)) is not None}
         return columns | {f"uncertainty_{part}_K": v for part, v in self.uncertainty_parts.items()}
 
     def to_dataframe(self) -> DataFrame:

@@ -40,8 +40,16 @@ COLUMNS = (
     Column("observations", "scalar_observations", "_OBSERVATIONS", "1", "thermal views that count"),
     Column("flags", "scalar_flags", "_FLAGS", "1", "bits of VertexFlag"),
 )
+# Of a subject that moved; absent from files of one that stood still.
+MOVED = Column("moved_mm", "scalar_moved", "_MOVED", "mm", "rms of the motion against the trunk")
+KNOWN = (*COLUMNS, MOVED)  # what readers look for
 PLY_PART = "scalar_uncertainty_"  # + name of a part of the budget
 TABLE_PART = "uncertainty_{}_K"  # in VTP and CSV
+
+
+def columns_of(mesh: ThermalMesh) -> tuple[Column, ...]:
+    """The columns that a mesh has."""
+    return COLUMNS if mesh.moved_mm is None else KNOWN
 
 
 def describe(
@@ -96,6 +104,7 @@ def result_from(
             anchored=description.get("level", "anchored") == "anchored",
             uncertainty_parts=dict(parts),
             metadata=metadata,
+            moved_mm=columns.get(MOVED.field),
             **{c.field: column(c.field) for c in COLUMNS},
         )
     except ValueError as e:

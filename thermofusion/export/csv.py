@@ -16,7 +16,7 @@ from ..errors import ScanError
 from ..files.reading import read_whole
 from ..files.whole import write_whole
 from ..types import ThermalMesh
-from .columns import COLUMNS, TABLE_PART, check_mesh
+from .columns import TABLE_PART, check_mesh, columns_of
 
 POSITION, NORMAL, WORDS = ("x_m", "y_m", "z_m"), ("nx", "ny", "nz"), ("output_mode", "level", "scan", "run")
 
@@ -26,7 +26,7 @@ def write_csv(path: str | Path, mesh: ThermalMesh) -> Path:
     check_mesh(mesh)
     columns = {name: (values, "%.6f") for name, values in zip(POSITION, mesh.surface.vertices_m.T, strict=True)}
     columns |= {name: (values, "%.4f") for name, values in zip(NORMAL, mesh.surface.normals.T, strict=True)}
-    for c in COLUMNS:
+    for c in columns_of(mesh):
         values = getattr(mesh, c.field)
         columns[c.field] = values, "%d" if values.dtype.kind in "iu" else "%.4f"
     columns |= {TABLE_PART.format(name): (values, "%.4f") for name, values in mesh.uncertainty_parts.items()}

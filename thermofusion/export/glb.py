@@ -23,7 +23,7 @@ from ..files.whole import write_whole
 from ..types import Bool, ThermalMesh
 from ..version import __version__
 from .axes import axes_of
-from .columns import COLUMNS, check_mesh, describe, result_from, surface_from, unit_normals
+from .columns import KNOWN, check_mesh, columns_of, describe, result_from, surface_from, unit_normals
 from .palettes import apply, color_range, srgb_to_linear, unmeasured_rgb
 
 FLOAT, UINT16, UINT32 = 5126, 5123, 5125  # glTF's componentType
@@ -82,7 +82,10 @@ def write_glb(
     shown = color_range(mesh.temperature_degC, range_degC)
     build = _Builder()
     meshes, omitted = _meshes(build, mesh, palette, shown)
-    description = describe(mesh, palette, shown) | {"units": {c.glb: c.unit for c in COLUMNS}, "omitted": omitted}
+    description = describe(mesh, palette, shown) | {
+        "units": {c.glb: c.unit for c in columns_of(mesh)},
+        "omitted": omitted,
+    }
     rotation = Rotation.from_matrix(axes_of(mesh.metadata)).as_quat(canonical=True).tolist()
     children = [{"name": m["name"], "mesh": i} for i, m in enumerate(meshes)]
     root = {"name": "thermofusion", "rotation": rotation, "children": list(range(1, len(meshes) + 1))}
@@ -159,7 +162,7 @@ def _attributes(
     linear[:, :3] = np.round(srgb_to_linear(np.arange(256, dtype=np.uint8)) * 65535).astype(np.uint16)[srgb]
     attributes = {"COLOR_0": build.accessor(build.view(linear, ARRAY_BUFFER), linear)}
     omitted = []
-    for column in COLUMNS:
+    for column in columns_of(mesh):
         values = getattr(mesh, column.field)[vertices].astype(np.float32)
         if np.isnan(values).any():
             omitted.append(column.glb)
@@ -198,7 +201,7 @@ def read_glb(path: str | Path) -> ThermalMesh:
             faces = _read(gltf, binary, primitive["indices"], path).astype(np.int64)
             stretches.append((int(accessors[at].get("byteOffset", 0)) // 12, p, n, faces.reshape(-1, 3)))
         attributes = primitives[SKIN]["attributes"] if SKIN in primitives else {}
-        found = {c.field: _read(gltf, binary, attributes[c.glb], path) for c in COLUMNS if c.glb in attributes}
+        found = {c.field: _read(gltf, binary, attributes[c.glb], path) for c in KNOWN if c.glb in attributes}
         count = max(first + len(p) for first, p, _, _ in stretches)
         if not 0 < count <= len(data) // 12:
             raise ValueError("vertices")

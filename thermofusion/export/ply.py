@@ -19,7 +19,7 @@ from ..errors import ScanError
 from ..files.reading import read_array, read_whole
 from ..files.whole import write_whole
 from ..types import ThermalMesh, UInt8
-from .columns import COLUMNS, PLY_PART, check_mesh, describe, result_from, surface_from
+from .columns import KNOWN, PLY_PART, check_mesh, columns_of, describe, result_from, surface_from
 from .palettes import apply, color_range
 
 XYZ, NORMAL, RGB = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
@@ -49,7 +49,7 @@ def write_ply(
     columns: dict[str, NDArray] = dict(zip(XYZ, mesh.surface.vertices_m.T, strict=True))
     columns |= dict(zip(NORMAL, mesh.surface.normals.T, strict=True))
     columns |= dict(zip(RGB, rgb.T, strict=True))
-    columns |= {c.ply: getattr(mesh, c.field) for c in COLUMNS}
+    columns |= {c.ply: getattr(mesh, c.field) for c in columns_of(mesh)}
     columns[QUALITY] = mesh.temperature_degC
     columns |= {PLY_PART + name: values for name, values in mesh.uncertainty_parts.items()}
 
@@ -77,7 +77,7 @@ def read_ply(path: str | Path) -> ThermalMesh:
     skin = set(RGB) <= set(names) and header.description.get("color", "skin") == "skin"
     color = _stack(vertices, RGB) if skin else None
     surface = surface_from(_stack(vertices, XYZ), faces["v"], normals, color, path)
-    columns = {c.field: vertices[c.ply] for c in COLUMNS if c.ply in names}
+    columns = {c.field: vertices[c.ply] for c in KNOWN if c.ply in names}
     parts = {n.removeprefix(PLY_PART): vertices[n] for n in names if n.startswith(PLY_PART)}
     return result_from(surface, columns, parts, header.description, path)
 
@@ -93,11 +93,12 @@ def _stack(vertices: NDArray, names: tuple[str, ...]) -> NDArray:
 
 
 def _header(vertices: NDArray, faces: NDArray, description: dict[str, Any]) -> bytes:
-    units = {c.ply: c.unit for c in COLUMNS} | {"x y z": "m", QUALITY: "degC"}
+    there = vertices.dtype.names or ()
+    units = {c.ply: c.unit for c in KNOWN if c.ply in there} | {"x y z": "m", QUALITY: "degC"}
     lines = ["ply", "format binary_little_endian 1.0"]
     lines += [line for key, value in (description | {"units": units}).items() for line in _comment(key, value)]
     lines.append(f"element vertex {len(vertices)}")
-    lines += [f"property {'uchar' if name in RGB else 'float'} {name}" for name in vertices.dtype.names or ()]
+    lines += [f"property {'uchar' if name in RGB else 'float'} {name}" for name in there]
     lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
     return "\n".join(lines).encode("ascii")
 

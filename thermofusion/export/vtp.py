@@ -15,7 +15,7 @@ from ..errors import ScanError
 from ..files.reading import read_array, read_whole
 from ..files.whole import write_whole
 from ..types import ThermalMesh
-from .columns import COLUMNS, TABLE_PART, check_mesh, describe, result_from, surface_from
+from .columns import COLUMNS, KNOWN, TABLE_PART, check_mesh, columns_of, describe, result_from, surface_from
 from .palettes import color_range
 
 NORMALS, SKIN, DESCRIPTION = "Normals", "color_rgb", "thermofusion"
@@ -50,7 +50,7 @@ def write_vtp(
     """
     check_mesh(mesh)
     surface, appended = mesh.surface, _Appended()
-    data = {NORMALS: surface.normals} | {c.field: getattr(mesh, c.field) for c in COLUMNS}
+    data = {NORMALS: surface.normals} | {c.field: getattr(mesh, c.field) for c in columns_of(mesh)}
     data |= {TABLE_PART.format(name): values for name, values in mesh.uncertainty_parts.items()}
     data |= {} if surface.color_rgb is None else {SKIN: surface.color_rgb}
     description = describe(mesh, palette, color_range(mesh.temperature_degC, range_degC))
@@ -105,7 +105,7 @@ def read_vtp(path: str | Path) -> ThermalMesh:
     normals, skin = (columns.pop(name, None) for name in (NORMALS, SKIN))
     surface = surface_from(next(iter(points.values())), triangles.reshape(-1, 3), normals, skin, path)
     head, tail = TABLE_PART.split("{}")
-    known = {c.field for c in COLUMNS}
+    known = {c.field for c in KNOWN}
     parts = {n[len(head) : -len(tail)]: v for n, v in columns.items() if n not in known and n.startswith(head)}
     return result_from(surface, {n: v for n, v in columns.items() if n in known}, parts, description, path)
 

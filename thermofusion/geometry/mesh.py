@@ -27,10 +27,10 @@ def canonical(vertices: Float32, triangles: NDArray) -> tuple[Float32, Int]:
     new[order] = np.cumsum(first) - 1
     tri = new[triangles]
     tri = tri[(tri[:, 0] != tri[:, 1]) & (tri[:, 1] != tri[:, 2]) & (tri[:, 2] != tri[:, 0])]
-    return ordered[first], _in_order(tri)
+    return ordered[first], in_order(tri)
 
 
-def _in_order(triangles: Int) -> Int:
+def in_order(triangles: Int) -> Int:
     """Triangles that start at their lowest vertex, sorted."""
     lead = triangles.argmin(1)[:, None]
     tri = np.take_along_axis(triangles, (lead + np.arange(3)) % 3, axis=1)
@@ -100,7 +100,8 @@ def close_pinholes(vertices: Float32, triangles: Int, max_round_m: float) -> Int
     """The triangles in `canonical` order, with fans over holes whose border is no longer than `max_round_m`.
 
     A pinhole is a voxel that too few frames filled. It is no edge of the subject, but would be taken for one wherever
-    silhouettes and open borders are kept clear of. No vertex is added. Holes that touch in a vertex stay open.
+    silhouettes and open borders are kept clear of. No vertex is added, no edge gets a third triangle: holes that touch
+    in a vertex, or whose fans would need an edge that is there already, stay open.
     vertices : (V, 3) m. triangles : (F, 3).
     """
     n = len(vertices)
@@ -111,6 +112,7 @@ def close_pinholes(vertices: Float32, triangles: Int, max_round_m: float) -> Int
     lone = (np.bincount(a, minlength=n)[a] == 1) & (np.bincount(b, minlength=n)[b] == 1)
     follower = dict(zip(a[lone].tolist(), b[lone].tolist(), strict=True))
     fans: list[tuple[int, int, int]] = []
+    drawn: set[tuple[int, int]] = set()
     while follower:
         start, following = follower.popitem()
         loop = [start]
@@ -121,10 +123,20 @@ def close_pinholes(vertices: Float32, triangles: Int, max_round_m: float) -> Int
         length = float(np.linalg.norm(border - np.roll(border, -1, axis=0), axis=1).sum())
         if following == start and len(loop) >= 3 and length <= max_round_m:
             loop = loop[(k := int(np.argmin(loop))) :] + loop[:k]  # whatever the border's start
-            fans += [(loop[0], loop[i + 1], loop[i]) for i in range(1, len(loop) - 1)]
+            turned = (loop[k:] + loop[:k] for k in range(len(loop)))
+            spread = next((fan for fan in turned if not _crosses(fan, along, drawn)), None)
+            if spread is not None:
+                drawn |= {(spread[0], corner) for corner in spread[2:-1]}
+                fans += [(spread[0], spread[i + 1], spread[i]) for i in range(1, len(spread) - 1)]
     if not fans:
         return triangles
-    return _in_order(np.concatenate([triangles, np.array(fans, np.int32)]))
+    return in_order(np.concatenate([triangles, np.array(fans, np.int32)]))
+
+
+def _crosses(loop: list[int], along: csr_matrix, drawn: set[tuple[int, int]]) -> bool:
+    """Whether a fan from the loop's first vertex would draw an edge that is there, or `drawn`, already."""
+    ends = ((loop[0], corner) for corner in loop[2:-1])
+    return any(along[a, b] or along[b, a] or (a, b) in drawn or (b, a) in drawn for a, b in ends)
 
 
 def smooth_positions(vertices: Float32, triangles: Int, iterations: int) -> Float32:

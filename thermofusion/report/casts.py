@@ -15,7 +15,7 @@ from ..geometry.rays import RayScene, barycentric
 from ..types import Float, Float32, Int, SurfaceMesh
 
 VIEWS = ("front", "back", "left", "right")
-DOUBTS = ("uncertainty", "residual")  # maps that are drawn beside the temperature's, on one page each
+DOUBTS = ("uncertainty", "residual", "motion")  # maps that are drawn beside the temperature's, on one page each
 RAYS = 2  # per pixel, along each side
 MARGIN = 0.02  # of the picture's height, round the surface
 MAX_ASPECT = 4.2  # width over height of all views side by side: four of a ball fit, and a floor stays small

@@ -164,6 +164,8 @@ def _maps(reported: Reported) -> list[dict[str, Any]]:
         scalar("count", "Thermal views", "", mesh.observations.astype(np.float64), 0),
         {**scalar("flag", "Flags", "", np.array([6.0]), 0, "rainbow"), "range": (0, 6)},
     ]
+    if mesh.moved_mm is not None:
+        maps.append(scalar("moved", "Motion against the trunk, rms", "mm", mesh.moved_mm, 1))
     if mesh.surface.color_rgb is not None:
         maps.append({"id": "color", "title": "Colour picture", "unit": "", "kind": "color", "digits": 0,
                      "range": (0, 1), "palette": "grey"})  # fmt: skip

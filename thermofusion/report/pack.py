@@ -84,6 +84,8 @@ def pack(temperature: Temperature, measurer: Measurer) -> tuple[Columns, dict[st
     out.steps("angle", mesh.view_angle_deg, 0.5, 1)
     out.whole("count", np.minimum(mesh.observations, 65535), 2)
     out.whole("flags", mesh.flags, 1)
+    if mesh.moved_mm is not None:
+        out.squares("moved", mesh.moved_mm)
     if mesh.surface.color_rgb is not None:
         out.whole("color", mesh.surface.color_rgb.T >> 2, 1)
     return out, _errors(out, measurer.errors)

@@ -88,7 +88,8 @@ def write_views(
     height_px: int = HEIGHT_PX,
     casts: list[Cast] | None = None,
 ) -> list[Path]:
-    """Write `front.png` … `overview.png`, and, where they are known, `uncertainty.png` and `residual.png`.
+    """Write `front.png` … `overview.png`, and, where they are known, `uncertainty.png`, `residual.png` and
+    `motion.png`.
 
     The folder is made if need be. Raises as `render_views`, ResourceError.
     """
@@ -215,7 +216,18 @@ def _doubts(mesh: ThermalMesh) -> dict[str, tuple[Float32, Scale]]:
         about += f"median {np.nanmedian(residual):.2f}; beyond 3 (hair, clothes, movement): {percent(much)}"
         scale = Scale("cividis", *RESIDUAL_RANGE, "sigmas", "How well the views agree", about, SHADING)
         maps["residual"] = residual, scale
+    if mesh.moved_mm is not None:
+        maps["motion"] = mesh.moved_mm, _motion_scale(mesh, mesh.moved_mm)
     return maps
+
+
+def _motion_scale(mesh: ThermalMesh, moved_mm: Float32) -> Scale:
+    """Of the picture of how much the subject moved (V,) mm."""
+    half, most, high = np.percentile(moved_mm, (50, 95, 99))
+    hi = palettes.color_range(np.array([0.0, high]), step=_round_step(np.array([0.0, high])))[1]
+    about = f"rms against the trunk while it was recorded; what is shown is at rest\n{_whose(mesh)}\n"
+    about += f"median {half:.1f} mm; a twentieth by more than {most:.1f} mm"
+    return Scale("cividis", 0.0, hi, "mm", "How the subject moved", about, SHADING)
 
 
 def _level_sigma(mesh: ThermalMesh) -> str:

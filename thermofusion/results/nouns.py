@@ -66,7 +66,8 @@ def _of_types() -> dict[str, type]:
         "thermal-camera/3": ThermalCamera,
         "thermal-camera/2": ThermalCamera,  # without `scatter`
         "thermal-camera/1": ThermalCamera,  # without `mount`
-        "thermal-mesh/2": ThermalMesh,
+        "thermal-mesh/3": ThermalMesh,
+        "thermal-mesh/2": ThermalMesh,  # without `moved_mm`
         "thermal-mesh/1": ThermalMesh,  # without `residual`
         "thermal-views/1": ThermalViews,
         "trajectory/1": Trajectory,

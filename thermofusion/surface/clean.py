@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..geometry.camera import project
+from ..geometry.manifold import manifold
 from ..geometry.mesh import components, keep_vertices, mesh_normals, vertex_areas
 from ..geometry.plane import floor_in_surface, refine_floor
 from ..geometry.rigid import invert, transform_points
@@ -110,6 +111,7 @@ def _pieces(
     """
     if len(triangles) == 0:
         return vertices, triangles, ()
+    vertices, triangles = manifold(vertices, triangles)  # what only touches in a point is a piece of its own
     areas = vertex_areas(vertices, triangles)
     label = components(triangles, len(vertices))
     area_cm2 = 1e4 * np.bincount(label, areas)
