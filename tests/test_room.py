@@ -12,8 +12,9 @@ from test_surroundings import sphere_part
 
 from thermofusion.diagnosis.radiation import of_room
 from thermofusion.geometry.sphere import N_CELLS, cell_directions, cell_of, cell_solid_angles, harmonics
-from thermofusion.mapping.background import SPREADS, Background, find_background
+from thermofusion.mapping.background import Background, find_background
 from thermofusion.physics.emissivity import Fresnel
+from thermofusion.physics.scatter import WIDTHS
 from thermofusion.physics.signal import SignalConverter
 from thermofusion.temperature import crosscal
 from thermofusion.temperature.room.harmonics import open_transfer
@@ -128,7 +129,7 @@ def background_of(world, calibration, room_L, seed=0):
     L = room_L(direction) + calibration.offset_radiance[view] + rng.normal(0, 0.02 * SLOPE, len(view))
     outliers = rng.random(len(view)) < 0.02
     L[outliers] += 5 * SLOPE
-    spread = np.zeros((len(view), len(SPREADS)), np.float32)
+    spread = np.zeros((len(view), len(WIDTHS)), np.float32)
     uv = (np.tile(x, n_views).astype(np.float32) for x in (u, v))
     return Background(
         view.astype(np.int32), direction.astype(np.float32), L.astype(np.float32), spread, *uv, n_views, 8
