@@ -14,7 +14,7 @@ import pytest
 from thermofusion.files.shipped import data_dir
 from thermofusion.files.tum import read_trajectory
 from thermofusion.geometry.rigid import invert, rotation_angle_deg
-from thermofusion.live.follow import Live, Sections, follow
+from thermofusion.live.follow import Live, Sections, _step, follow
 from thermofusion.live.model import SECTORS, Model
 from thermofusion.live.page import Page
 from thermofusion.live.walk import Walk
@@ -23,6 +23,7 @@ from thermofusion.recording.record import Beside, Until, record
 from thermofusion.recording.replay import open_replay, playing
 from thermofusion.scans import open_scan
 from thermofusion.scans.formats.recorded import Growing
+from thermofusion.tracking.odometry import MAX_GAP_FRAMES
 
 
 @pytest.fixture(scope="module")
@@ -156,3 +157,11 @@ def test_the_page_is_served_to_this_machine_alone():
         assert refused.value.code == 404
     finally:
         page.close()
+
+
+def test_a_burst_is_shown_as_far_as_there_is_time():
+    assert [_step(waiting, 0.0) for waiting in (1, 6, 400)] == [1, 1, 1]
+    assert _step(6, 0.05) == 1  # eight would be done before the next burst
+    assert _step(6, 0.15) == 3  # two can be done
+    assert _step(6, 2.0) == MAX_GAP_FRAMES  # no farther than tracking can jump
+    assert _step(1, 2.0) == 1

@@ -17,8 +17,10 @@ from ..types import Float32, Scan
 from .model import Model, apparent_degC, seen_by_thermal
 from .walk import FASTEST_DEG_S, Walk
 
-LOOK_S = 0.35  # the file is looked at so often
+LOOK_S = 0.1  # the file is looked at so often
+BURST_S = 0.4  # frames come in bursts: a recording is written to the disk so often
 FIRST_FRAMES = 5  # depth frames that must be there to begin
+LATE = 0.7  # of the last update's time, which the next one's guess does not fall below
 PAIR_S = 0.04  # a thermal frame and a depth frame this far apart show the same
 SILENT_S = 10.0  # without a new frame for so long, whoever records has died
 MISSING_S = 1.0  # what is missing is worked out so often
@@ -79,7 +81,7 @@ def follow(
     growing, live = Growing(path), Live()
     painter = _Painter(recipe)
     next_frame, updated_at, new_at = 0, 0.0, time.monotonic()
-    looked_at = 0.0
+    looked_at, took_s = 0.0, 0.0
     while not stop():
         now = time.monotonic()
         if now - looked_at >= LOOK_S:
@@ -94,12 +96,15 @@ def follow(
                 break
             time.sleep(0.02)
             continue
-        last = next_frame if growing.complete else count - 1  # the newest, no farther ahead than tracking can jump
-        i = min(last, next_frame + MAX_GAP_FRAMES - 1)
+        i = next_frame
+        if not growing.complete:  # as many frames of a burst as can be done before the next one
+            i += _step(count - next_frame, took_s) - 1
         live.skipped += i - next_frame
         next_frame = i + 1
+        begun = time.monotonic()
         painter.paint(i, live)
         done = time.monotonic()
+        took_s = max(done - begun, LATE * took_s)
         if updated_at:
             live.intervals_s.append(done - updated_at)
         updated_at = done
@@ -107,6 +112,12 @@ def follow(
     live.ended = True
     show(live)
     return live
+
+
+def _step(waiting: int, took_s: float) -> int:
+    """How many frames on the next one to paint is, of `waiting`: no farther than tracking can jump."""
+    affordable = max(1, int(BURST_S / max(took_s, 1e-3)))
+    return min(-(-waiting // affordable), MAX_GAP_FRAMES)
 
 
 class _Painter:
