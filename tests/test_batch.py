@@ -110,6 +110,44 @@ def test_scans_are_found_once_and_results_are_none(scans, tmp_path):
         place_for(str(folder) + "/", str(folder))
 
 
+def test_no_two_scans_share_a_folder_and_none_lies_in_another_s(scans, tmp_path):
+    for name in ("s.bag", "s.mkv", "s.bag.mkv", "t.bag", "u.bag", "U.mkv"):
+        (tmp_path / name).write_bytes(b"#ROSBAG V2.0" if name.endswith("bag") else b"\x1a\x45\xdf\xa3")
+    for name in ("t/inside", "batch.json"):
+        shutil.copytree(scans / "p1", tmp_path / name)
+    found = find_scans(str(tmp_path), str(tmp_path / "out"))
+    names = [s.name for s in found]
+    assert len(names) == 8
+    assert {"t.bag", "t/inside", "u.bag", "U.mkv", "s.mkv", "batch.json-2"} < set(names)  # the page keeps its names
+    assert len({name.casefold() for name in names}) == len(names)
+    assert not {parent for name in names for parent in map(str, Path(name).parents)} & set(names)
+    assert found == find_scans(str(tmp_path), str(tmp_path / "out"))
+
+
+def test_images_on_another_disk_count_and_folders_that_cannot_be_read_are_told(scans, tmp_path, monkeypatch):
+    (tmp_path / "all").mkdir()
+    shutil.copytree(scans / "p1", tmp_path / "all" / "p1")
+    (tmp_path / "all" / "p1" / "depth").rename(tmp_path / "disk")
+    (tmp_path / "all" / "p1" / "depth").symlink_to(tmp_path / "disk")
+    (before,) = find_scans(str(tmp_path / "all"), "out")
+    os.utime(next((tmp_path / "disk").iterdir()), (1, 1))
+    assert find_scans(str(tmp_path / "all"), "out")[0].content != before.content
+    (tmp_path / "all" / "locked").mkdir()
+    inside = Path.iterdir
+
+    def refused(folder):
+        if folder.name == "locked":
+            raise PermissionError(13, "Permission denied")
+        return inside(folder)
+
+    monkeypatch.setattr(Path, "iterdir", refused)
+    locked = find_scans(str(tmp_path / "all"), "out")[0]
+    assert locked.name == "locked"
+    row = fuse_one(Job(locked, {}, str(tmp_path / "out")))
+    assert row.status == "failed"
+    assert row.exit_code == 3
+
+
 # ---------------------------------------------------------------- workers
 
 
@@ -136,6 +174,8 @@ def test_one_bad_scan_stops_nothing_and_finished_ones_are_left_alone(scans, reci
     changed = load_recipe({}, [*BASE, "output.formats=[]"])
     assert remembered(jobs_of(scans, recipe, tmp_path)[0]) is not None
     assert remembered(jobs_of(scans, changed, tmp_path)[0]) is None
+    (tmp_path / "p1" / "mesh.ply").unlink()  # a result that lost a file is made whole
+    assert remembered(jobs_of(scans, recipe, tmp_path)[0]) is None
 
 
 def dies_once(job):

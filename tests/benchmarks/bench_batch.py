@@ -26,6 +26,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
@@ -93,12 +94,28 @@ def small_scans(folder: Path, count: int) -> list[str]:
 
 def workers_of(pid: int) -> list[int]:
     """Processes that a batch has started for scans."""
-    listed = subprocess.run(["ps", "-o", "pid=,args=", "--ppid", str(pid)], capture_output=True, text=True).stdout
-    return [int(line.split()[0]) for line in listed.splitlines() if "spawn_main" in line]
+    found = []
+    for entry in Path("/proc").iterdir():
+        with suppress(OSError, ValueError):
+            parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+            if parent == pid and b"spawn_main" in (entry / "cmdline").read_bytes():
+                found.append(int(entry.name))
+    return found
+
+
+def killed_once(command: list[str], after_s: float, chance: random.Random) -> tuple[int, bool, float]:
+    """A batch of which one worker is killed: (exit code, whether there was one to kill, its wall time)."""
+    start = time.monotonic()
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    time.sleep(after_s)
+    victims = workers_of(process.pid) if process.poll() is None else []
+    if victims:
+        os.kill(chance.choice(victims), signal.SIGKILL)
+    return process.wait(), bool(victims), time.monotonic() - start
 
 
 def kills(folder: Path, count: int) -> None:
-    """A worker is killed at a random moment of each batch."""
+    """A worker is killed at a random moment of each batch; a batch that was over by then does not count."""
     options = small_scans(folder / "scans", 3)
     names = sorted(p.name for p in (folder / "scans").iterdir())
     for name in names:
@@ -107,22 +124,24 @@ def kills(folder: Path, count: int) -> None:
     out = folder / "out"
     command = [*PROGRAM, "batch", str(folder / "scans"), *options, "-o", str(out), "--workers", "2"]
     whole, _ = timed(command)
-    chance, good, hit, attempts = random.Random(0), 0, 0, 0
-    for number in range(count):
+    chance, good, hit, attempts, rounds = random.Random(0), 0, 0, 0, 0
+    while hit < count and rounds < 3 * count:
+        rounds += 1
         shutil.rmtree(out)
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        time.sleep(chance.uniform(0.15, 0.9) * whole)
-        victims = workers_of(process.pid)
-        if victims:
-            os.kill(chance.choice(victims), signal.SIGKILL)
-            hit += 1
-        code = process.wait()
+        after_s = chance.uniform(0.1, 0.95) * whole
+        code, killed, wall = killed_once(command, after_s, chance)
+        whole = whole if killed else wall  # the machine is busier at one time than at another
+        if not killed:
+            continue
+        hit += 1
         rows = json.loads((out / "batch.json").read_text())["scans"]
-        attempts += sum(r["attempts"] for r in rows) - len(rows)
+        again = sum(r["attempts"] for r in rows) - len(rows)
+        attempts += again
         same = all(digests(out / name) == expected[name] for name in names)
         good += code == 0 and same
-        print(f"{number + 1}/{count}: exit {code}, {'equal' if same else 'DIFFERENT'}", flush=True)
-    print(f"{good} of {count} batches whole and equal bit for bit; {hit} workers killed, {attempts} in mid-scan")
+        told = "equal" if same else "DIFFERENT"
+        print(f"{hit}/{count}: after {after_s:.1f} s, {again} begun again, exit {code}, {told}", flush=True)
+    print(f"{good} of {hit} batches whole and equal bit for bit; {attempts} killed in mid-scan")
 
 
 def sleeps(job):

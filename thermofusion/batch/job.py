@@ -189,14 +189,15 @@ def remember(job: Job, row: Row) -> None:
 
 def remembered(job: Job) -> Row | None:
     """The row of a finished result that came of the same inputs and still stands; else None."""
-    from ..results.folder import REPORT
+    from ..results.claim import REPORT, listed
 
     if is_address(job.out):
         store = Store(job.out)
         text = store.read(_row_name(job)) or b""
         there = bool(text) and store.read(f"{job.source.name}/{REPORT}") is not None
     else:
-        there = (Path(job.folder) / REPORT).is_file()
+        folder = Path(job.folder)
+        there = (folder / REPORT).is_file() and all((folder / name).is_file() for name in listed(folder))
     if not there:
         return None
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from hashlib import sha256
@@ -16,6 +17,8 @@ from .store import Entry, Store, is_address
 FILE_SUFFIXES = (".mcap", ".bag", ".db3", ".db", ".mkv", ".sens", ".r3d")
 # What tells a folder behind an address, where no reader can look before it is copied.
 FOLDER_SIGNS = ("scan.json", "frames.csv", "recording.mcap", "INDEX.txt", "scene_camera.json", "odometry.csv")
+KEPT = ("batch.html", "batch.csv", "batch.json")  # names of the batch's own files
+UNREADABLE = "unreadable"  # in the place of a hash
 NO_SCAN = ("flir",)  # formats of thermal frames alone: there is no surface to be made of them
 
 
@@ -66,6 +69,7 @@ def _below(root: Path, out: str) -> Iterator[tuple[PurePosixPath, str, str]]:
                     (p for p in path.iterdir() if not p.name.startswith(".")), key=lambda p: (p.is_symlink(), p.name)
                 )
             except OSError:
+                yield name, str(path), UNREADABLE  # it may hold scans: the table says so
                 return
             for part in inside:
                 if part.is_dir() or part.suffix.lower() in FILE_SUFFIXES:
@@ -87,7 +91,13 @@ def _files(path: Path) -> Iterator[Entry]:
         stat = path.stat()
         yield Entry(path.name, stat.st_size, str(stat.st_mtime_ns))
         return
-    for folder, _, names in os.walk(path):
+    seen: set[str] = set()
+    for folder, below, names in os.walk(path, followlinks=True):  # images may lie on another disk
+        real = os.path.realpath(folder)
+        if real in seen:
+            below.clear()  # a link that leads round
+            continue
+        seen.add(real)
         for name in names:
             file = Path(folder, name)
             try:
@@ -116,11 +126,25 @@ def _behind(store: Store) -> Iterator[tuple[PurePosixPath, str, str]]:
 
 
 def _named(found: Iterable[tuple[PurePosixPath, str, str]]) -> Iterator[Source]:
-    """Results bear the scans' names without suffixes, unless two would share one."""
-    found = list(found)
-    short = [str(n.with_suffix("")) if n.suffix.lower() in FILE_SUFFIXES else str(n) for n, _, _ in found]
+    """Results bear the scans' names without suffixes, unless their folders would be one, or lie in another's."""
+    found = sorted(found)
+    short = [n.with_suffix("") if n.suffix.lower() in FILE_SUFFIXES else n for n, _, _ in found]
+    taken = Counter(_folded(name) for name in short)
+    above = {_folded(parent) for name in short for parent in name.parents}
+    used: set[str] = set()
     for name, (whole, place, content) in zip(short, found, strict=True):
-        yield Source(name if short.count(name) == 1 else str(whole), place, content)
+        own = name if taken[_folded(name)] == 1 and _folded(name) not in above else whole
+        number, free = 1, own
+        while _folded(free) in used or _folded(free) in KEPT:  # a.bag beside a.mkv and a.bag.mkv
+            number += 1
+            free = own.with_name(f"{own.name}-{number}")
+        used.add(_folded(free))
+        yield Source(str(free), place, content)
+
+
+def _folded(name: PurePosixPath) -> str:
+    """As file systems compare names that do not tell large letters from small ones."""
+    return str(name).casefold()
 
 
 def content_of(entries: Iterable[Entry]) -> str:
