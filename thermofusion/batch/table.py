@@ -89,12 +89,18 @@ def page_of(rows: Sequence[Row], recipe: str) -> str:
     columns = {k: v for k, v in SHOWN.items() if any(k in row.figures for row in rows)}
     head = "".join(
         f'<th scope="col"{" class=text" if kind else ""}><button type="button">{escape(title)}</button></th>'
-        for title, kind in [("scan", 1), ("status", 1), *((t, 0) for t, _ in columns.values()), ("time, s", 0)]
+        for title, kind in [
+            ("scan", 1),
+            ("status", 1),
+            ("why", 1),
+            *((t, 0) for t, _ in columns.values()),
+            ("time, s", 0),
+        ]
     )
     parts = {
         "TITLE": escape(f"{counted(len(rows), 'scan')} with {recipe}: thermofusion batch"),
         "SAID": escape(f"{counted(len(rows), 'scan')} with recipe {recipe}: {said}"),
-        "HEAD": head + '<th scope="col" class=text>why</th>',
+        "HEAD": head,
         "ROWS": "\n".join(_row(row, columns) for row in rows),
         "FOOT": escape(f"thermofusion {__version__} · research use, not a diagnosis"),
     }
@@ -115,10 +121,10 @@ def _row(row: Row, columns: dict[str, tuple[str, int]]) -> str:
     code = f" ({row.exit_code})" if row.exit_code else ""
     mark = "good" if row.status == DONE[0] else "bad" if row.status == FAILED else "doubt"
     cells = [f'<th scope="row" class=text>{name}</th>', f'<td class="text {mark}">{escape(row.status)}{code}</td>']
+    cells.append(f'<td class="text why"><bdi>{escape(row.reason)}</bdi></td>')
     for key, (_, digits) in columns.items():
         value = row.figures.get(key)
         shown = "" if value is None else f"{value:.{digits}f}"
         cells.append(f'<td data-value="{"" if value is None else json.dumps(plain(value))}">{shown}</td>')
     cells.append(f'<td data-value="{row.wall_s}">{row.wall_s:.1f}</td>')
-    cells.append(f"<td class=text><bdi>{escape(row.reason)}</bdi></td>")
     return f"<tr>{''.join(cells)}</tr>"
