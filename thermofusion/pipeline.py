@@ -35,7 +35,7 @@ STAGES = (
     Stage("tracking", ("input", "subject", "tracking")),
     Stage("surface", ("input", "subject", "surface"), edition=4),
     Stage("rig", ("input", "rig"), edition=3),
-    Stage("mapping", ("input", "mapping"), edition=9),
+    Stage("mapping", ("input", "mapping"), edition=10),
     Stage("temperature", ("mapping", "temperature"), edition=10, handed_out=RESULT),
 )
 STAGE_NAMES = tuple(stage.name for stage in STAGES)

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -48,8 +49,10 @@ class Background:
 
     view : (N,) row of the thermal views. direction : (N, 3) unit, world, from the camera into the room. radiance : (N,)
     mean over a block as the camera reports it, W m-2 sr-1. spread : (N, K) the same of the whole picture blurred with
-    one sigma of `WIDTHS` image widths. u_px, v_px : (N,) a block's middle. n_views : that were looked at; block_px :
-    side of a block, px.
+    one sigma of `WIDTHS` image widths; halo : (N, K) of the picture in which the room itself is even: what the subject
+    sheds, and no window sheds on itself. u_px, v_px : (N,) a block's middle. n_views : that were looked at; block_px :
+    side of a block, px. span_m : radius of the room about middle_m (3,), from which directions are then seen; inf =
+    endless, as the cameras see it.
     """
 
     view: Int
@@ -60,6 +63,9 @@ class Background:
     v_px: Float32
     n_views: int
     block_px: int
+    halo: Float32 = field(default_factory=lambda: np.zeros((0, len(WIDTHS)), np.float32))
+    span_m: float = float("inf")
+    middle_m: Float = field(default_factory=lambda: np.zeros(3))
 
     __repr__ = brief
 
@@ -94,13 +100,16 @@ class BackgroundFinder:
             T_K = converter.band.temperature_K(float(np.nanmedian(mean)))
             self._netd_L = self._stream.camera.netd_K * float(converter.band.d_radiance_dT(T_K))
         direction = self.rays @ T_world_thermal[:3, :3].T.astype(np.float32)
-        free = self._free(mean, direction, T_world_thermal[:3, 3]) & (noise > LEAST_NOISE * self._netd_L)
-        free &= np.isfinite(mean) & np.isfinite(self.rays[..., 0]) & ~self._near_sources(frame)
+        room = self._free(mean, direction, T_world_thermal[:3, 3]) & ~self._near_sources(frame)
+        free = room & (noise > LEAST_NOISE * self._netd_L) & np.isfinite(mean) & np.isfinite(self.rays[..., 0])
         whole = np.where(np.isfinite(mean), mean, np.nanmedian(mean)).astype(np.float32)
+        shed = np.where(room, np.median(whole[room]), whole).astype(np.float32) if room.any() else whole
+        sigmas_px = [s * self.shape[1] for s in WIDTHS]
         return {
             "direction": direction[free],
             "radiance": mean[free],
-            "spread": np.stack([blurred(whole, s * self.shape[1])[free] for s in WIDTHS], axis=1),
+            "spread": np.stack([blurred(whole, s)[free] for s in sigmas_px], axis=1),
+            "halo": np.stack([blurred(shed, s)[free] for s in sigmas_px], axis=1),
             "u_px": self.u_px[free],
             "v_px": self.v_px[free],
         }
@@ -166,6 +175,6 @@ def find_background(
 
     with ThreadPoolExecutor(max_workers=3) as pool:
         found = list(pool.map(one, chosen.tolist()))
-    columns = {name: np.concatenate([f[name] for f in found]) for name in found[0]}
+    columns: dict[str, Any] = {name: np.concatenate([f[name] for f in found]) for name in found[0]}
     view = np.repeat(chosen, [len(f["radiance"]) for f in found]).astype(np.int32)
     return Background(view=view, n_views=len(chosen), block_px=finder.block_px, **columns)

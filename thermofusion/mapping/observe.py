@@ -45,6 +45,7 @@ from .corrections import MotionResult, view_corrections
 from .pixels import bad_pixels
 from .references import BlackbodyReading, read_blackbodies
 from .scatter import check_scatter, estimate_scatter, spread_on
+from .span import placed
 from .views import thermal_views
 
 EDGE_CAP_PX = 32.0  # distances to a silhouette are stored up to here; nothing depends on larger ones
@@ -178,6 +179,7 @@ def observe(
         converter = SignalConverter(stream.camera, bad)
     background = find_background(stream, surface, views, converter, scan.references)
     lens, stated = stream.camera.lens, stream.camera.scatter
+    background = placed(background, views, surface.vertices_m.mean(axis=0, dtype=np.float64), lens, converter.band)
     if stated is None:
         scatter = estimate_scatter(background, lens, converter.band)
     else:

@@ -1,8 +1,10 @@
 """How much light the lens spreads, from the halo round the subject on the background of the scan itself.
 
-    y = room(direction) + b_view + φ(u, v) + Σ g_k (K_k∗y - y),      g_k >= 0
+    y = room(direction) + b_view + φ(u, v) + Σ g_k K_k∗y',      g_k >= 0
 
-Room and field are of order 2, a cell of 10° may differ: a warm wall stays where it is, a halo goes with the subject.
+y' is the picture with an even room round the subject: a window's own halo stands still with it and belongs to the room,
+and a window explained by its own blur would tell of no lens. Room and field are of order 2, a cell of 10° may differ: a
+warm wall stays where it is, a halo goes with the subject.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from ..types import Camera, Float, Float32, LensScatter, Observations, ThermalSt
 from .background import Background
 
 ROWS = 30_000  # blocks of background that are asked, evenly
+FEWER_ROWS = 10_000  # where only their agreement is asked
 LEAST_ROWS, LEAST_VIEWS = 3000, 8
 FOLDS = 6  # blocks of views that are left out in turn
 ROUNDS = 3  # of reweighting
@@ -71,7 +74,16 @@ def _asked(background: Background, lens: Camera, band: Band) -> tuple[list[HaloN
         return None
     slope_L = float(band.d_radiance_dT(band.temperature_K(float(np.median(background.radiance)))))
     rows = np.arange(0, len(background), max(1, -(-len(background) // ROWS)))
-    return _normals(background, rows, (lens.width_px, lens.height_px), slope_L)
+    return _normals(background, rows, (lens.width_px, lens.height_px), slope_L)[:2]
+
+
+def disagreement(background: Background, lens: Camera, band: Band) -> float:
+    """How little readings of one direction agree among views, in logarithms; NaN where hardly any is seen."""
+    if len(background) < LEAST_ROWS or len(np.unique(background.view)) < LEAST_VIEWS:
+        return float("nan")
+    slope_L = float(band.d_radiance_dT(band.temperature_K(float(np.median(background.radiance)))))
+    rows = np.arange(0, len(background), max(1, -(-len(background) // FEWER_ROWS)))
+    return _normals(background, rows, (lens.width_px, lens.height_px), slope_L)[2]
 
 
 def _solved(parts: list[HaloNormal], prior: Float, shapes: Float) -> tuple[Float, float, float]:
@@ -85,21 +97,23 @@ def _solved(parts: list[HaloNormal], prior: Float, shapes: Float) -> tuple[Float
 
 def _normals(
     background: Background, rows: NDArray, image_px: tuple[int, int], slope_L: float
-) -> tuple[list[HaloNormal], Float]:
-    """Normal equations by block of views, and the prior's inverse variances (P,)."""
+) -> tuple[list[HaloNormal], Float, float]:
+    """Normal equations by block of views, the prior's inverse variances (P,), and how much is left: mean of
+    log(1 + (r/NOISE_K)²)."""
     direction, view = background.direction[rows].astype(np.float64), background.view[rows]
     _, view = np.unique(view, return_inverse=True)
     cells, cell = np.unique(cell_of(direction), return_inverse=True)
     x, y_px = (2 * background.u_px[rows] / image_px[0] - 1), (2 * background.v_px[rows] / image_px[1] - 1)
     y = background.radiance[rows].astype(np.float64)
+    middle = np.median(y)
     design = np.column_stack(
-        [background.spread[rows] - y[:, None], harmonics(direction), x, y_px, x * x, x * y_px, y_px * y_px]
+        [background.halo[rows] - middle, harmonics(direction), x, y_px, x * x, x * y_px, y_px * y_px]
     )
     R, n, M, C = len(rows), design.shape[1], int(view.max()) + 1, len(cells)
     index = np.column_stack([np.tile(np.arange(n), (R, 1)), n + view, n + M + cell])
     value = np.column_stack([design, np.ones((R, 2))])
     A = csr_matrix((value.ravel(), index.ravel(), np.arange(0, R * (n + 2) + 1, n + 2)), shape=(R, n + M + C))
-    y = y - np.median(y)
+    y = y - middle
     K = len(WIDTHS)
     wide, texture = (WIDE_K * slope_L) ** -2, (CELL_K * slope_L) ** -2
     prior = np.concatenate([np.zeros(K), np.full(n - K + M, wide), np.full(C, texture)])
@@ -117,7 +131,7 @@ def _normals(
         mine = np.flatnonzero(block == fold)
         a = A[mine]
         parts.append(HaloNormal((a.T @ a.multiply(w[mine, None]).tocsr()).toarray(), a.T @ (w[mine] * y[mine])))
-    return parts, prior
+    return parts, prior, float(np.mean(np.log1p((r / (NOISE_K * slope_L)) ** 2)))
 
 
 def spread_on(

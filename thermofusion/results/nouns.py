@@ -94,7 +94,8 @@ def stored() -> MappingProxyType[str, type]:
         {
             **_shape(),
             **_of_types(),
-            "background/1": Background,
+            "background/2": Background,
+            "background/1": Background,  # without `halo`
             "blackbody-reading/1": BlackbodyReading,
             "calibration/1": Calibration,
             "free-views/1": FreeViews,
