@@ -211,7 +211,11 @@ def test_an_absent_library_is_named(name, make, monkeypatch):
 
 
 # What inside functions may be Linux's own: a terminal's keys, and cameras that only V4L2 knows.
-LATE = {"thermofusion/cli/record.py": {"termios", "tty"}, "thermofusion/recording/devices/v4l2.py": {"fcntl"}}
+LATE = {
+    "thermofusion/batch/job.py": {"resource"},
+    "thermofusion/cli/record.py": {"termios", "tty"},
+    "thermofusion/recording/devices/v4l2.py": {"fcntl"},
+}
 
 
 def test_types_are_shipped_and_posix_is_not_needed():
