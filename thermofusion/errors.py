@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import ClassVar
 
 INTERRUPTED = 130  # exit code after Ctrl-C, as shells count it
@@ -91,6 +93,20 @@ class ResourceError(ThermofusionError):
 
 class BusyError(ResourceError):
     """Another run has the result folder."""
+
+
+@contextmanager
+def placed(place: object) -> Iterator[None]:
+    """A ScanError raised inside that names no place names this one."""
+    try:
+        yield
+    except ScanError as e:
+        raise ScanError(e.cause, place=e.place or place, hint=e.hint) from None
+
+
+def told_by(error: BaseException) -> str:
+    """What another library's error says, on one line; its kind where it says nothing."""
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 def exit_of(error: BaseException) -> tuple[int, str]:

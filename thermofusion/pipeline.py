@@ -19,7 +19,7 @@ from .files.reading import read_json
 from .progress import Progress, silent
 from .recipe import RENAMED_STAGES, Recipe
 from .report.summary import Steps, summary
-from .results.claim import REPORT, claimed, listed
+from .results.claim import REPORT, claimed, complete
 from .results.folder import RESULT, Result, add_files, load_mesh, names_of, write_result
 from .results.frame import frame_of
 from .results.stages import Computes, Stage, StagePlan, Stages, fingerprint, run_id
@@ -91,8 +91,7 @@ def finished(scan: Scan, recipe: Recipe, out: Path) -> dict[str, Any] | None:
     last = STAGE_NAMES.index("surface" if scan.thermal is None else STAGE_NAMES[-1])
     reusable = [run.stages.plan(stage).reuse for stage in STAGES[: last + 1]][-1]
     known = isinstance(report, dict) and report.get("run") == run_id(run.stages.key, _said(recipe))
-    whole = known and reusable and all((out / name).is_file() for name in listed(out))
-    return report if whole else None
+    return report if known and reusable and complete(out) else None
 
 
 def _said(recipe: Recipe) -> dict[str, Any]:

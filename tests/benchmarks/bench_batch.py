@@ -31,7 +31,7 @@ from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 
-from thermofusion.batch.batch import Crew, Heard, run_batch
+from thermofusion.batch.batch import Crew, run_batch
 from thermofusion.batch.job import Row
 from thermofusion.batch.scans import Source
 from thermofusion.recipe import load_recipe
@@ -161,9 +161,7 @@ def cluster(folder: Path, count: int, scheduler: str = "local") -> None:
             memory.append(f"{rss:.0f} MiB after {done}")
 
     start = time.monotonic()
-    rows = run_batch(
-        sources, load_recipe("torso"), str(folder), Crew(workers, 1, scheduler), work=sleeps, heard=Heard(heard)
-    )
+    rows = run_batch(sources, load_recipe("torso"), str(folder), Crew(workers, 1, scheduler), work=sleeps, tell=heard)
     wall = time.monotonic() - start
     ideal = count * SLEEP_S / workers
     print(

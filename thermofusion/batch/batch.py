@@ -54,15 +54,16 @@ def _memory_GiB() -> float:
     return 1e3
 
 
-@dataclass(frozen=True)
-class Heard:
-    """Told of each row as it comes: the row, how many are done, how many there are, seconds left or None."""
+# Told of each row as it comes: the row, how many are done, how many there are, seconds left or None.
+Tell = Callable[[Row, int, int, float | None], None]
 
-    tell: Callable[[Row, int, int, float | None], None] = lambda *_: None
+
+def _silent(row: Row, done: int, total: int, left_s: float | None) -> None:
+    """Nobody listens."""
 
 
 def run_batch(
-    sources: Sequence[Source], recipe: Recipe, out: str, crew: Crew, *, work: Work = fuse_one, heard: Heard = Heard()
+    sources: Sequence[Source], recipe: Recipe, out: str, crew: Crew, *, work: Work = fuse_one, tell: Tell = _silent
 ) -> list[Row]:
     """Fuse all scans into folders of `out` (a path or an fsspec address); a row each, in the order of `sources`.
 
@@ -82,7 +83,7 @@ def run_batch(
             for count, (job, row) in enumerate(results, 1):
                 rows[job.source.name] = row
                 rate_s = (time.monotonic() - begun) / count
-                heard.tell(row, len(jobs) - len(left) + count, len(jobs), rate_s * (len(left) - count))
+                tell(row, len(jobs) - len(left) + count, len(jobs), rate_s * (len(left) - count))
                 if time.monotonic() - written > SUMMARY_EVERY_S:
                     write(list(rows.values()))
                     written = time.monotonic()

@@ -11,9 +11,9 @@ from dataclasses import replace
 from importlib import import_module
 from typing import Any
 
-from ..errors import RecipeError, ResourceError
+from ..errors import RecipeError, ResourceError, told_by
 from .job import Job, Row, Work
-from .pool import ALONE, TRIES, killed
+from .pool import TRIES, killed, thread_limits
 
 LOCAL = "local"  # what --scheduler calls a cluster on this machine
 CONNECT_S = 30.0  # for a scheduler to answer
@@ -45,9 +45,9 @@ def in_cluster(
             except (OSError, TimeoutError) as e:  # CommClosedError is an OSError
                 reconnects += 1
                 if reconnects > RECONNECTS:
-                    cause = " ".join(str(e).split()) or type(e).__name__
+                    text = f"the scheduler does not answer ({told_by(e)})"
                     hint = "what is finished is kept: the same command goes on from there"
-                    raise ResourceError(f"the scheduler does not answer ({cause})", place=address, hint=hint) from None
+                    raise ResourceError(text, place=address, hint=hint) from None
                 time.sleep(1.0)
 
 
@@ -98,9 +98,8 @@ def _address(dask: Any, scheduler: str, workers: int, threads: int) -> Iterator[
     if scheduler != LOCAL:
         yield scheduler
         return
-    environment = {"OMP_NUM_THREADS": str(threads)} | dict.fromkeys(ALONE, "1")
     settings = {"n_workers": workers, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
-    with dask.LocalCluster(**settings, env=environment, memory_limit=0, silence_logs=OFF) as cluster:
+    with dask.LocalCluster(**settings, env=thread_limits(threads), memory_limit=0, silence_logs=OFF) as cluster:
         yield cluster.scheduler_address
 
 

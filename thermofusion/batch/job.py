@@ -16,12 +16,11 @@ from typing import Any
 from ..errors import BusyError, QualityError, ScanError, exit_of, visible
 from ..files.json import plain, to_json
 from ..files.reading import read_json
-from ..files.whole import write_text
 from ..progress import Progress, silent
 from ..recipe import load_recipe
 from ..version import __version__
 from .scans import Source
-from .store import Mirror, Store, at_hand, is_address, scratch
+from .store import Mirror, Store, at_hand, is_address, put, scratch
 
 ROWS = ".batch"  # sub-folder of a batch that remembers each scan's row
 GOOD, BELOW, FAILED, WAITING = "good", "below gate", "failed", "not done"
@@ -181,23 +180,19 @@ def figures_of(report: Mapping[str, Any]) -> dict[str, Any]:
 def remember(job: Job, row: Row) -> None:
     """Store a scan's row with the hash of its inputs. Raises ResourceError."""
     text = to_json({"software": f"thermofusion {__version__}", "inputs": job.inputs, "row": asdict(row)})
-    if is_address(job.out):
-        Store(job.out).write(_row_name(job), text.encode())
-    else:
-        write_text(Path(job.out) / _row_name(job), text, whatever=True)
+    put(job.out, _row_name(job), text, whatever=True)
 
 
 def remembered(job: Job) -> Row | None:
     """The row of a finished result that came of the same inputs and still stands; else None."""
-    from ..results.claim import REPORT, listed
+    from ..results.claim import REPORT, complete
 
     if is_address(job.out):
         store = Store(job.out)
         text = store.read(_row_name(job)) or b""
         there = bool(text) and store.read(f"{job.source.name}/{REPORT}") is not None
     else:
-        folder = Path(job.folder)
-        there = (folder / REPORT).is_file() and all((folder / name).is_file() for name in listed(folder))
+        there = complete(Path(job.folder))
     if not there:
         return None
     try:

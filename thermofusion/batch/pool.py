@@ -25,6 +25,11 @@ PATIENCE_S = 5.0  # for a worker that was asked to end
 ALONE = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 
 
+def thread_limits(threads: int) -> dict[str, str]:
+    """Of a worker's environment: OpenMP's threads, and one for BLAS."""
+    return {"OMP_NUM_THREADS": str(threads)} | dict.fromkeys(ALONE, "1")
+
+
 class _Worker:
     """A process, the pipe to it, and the scan it has."""
 
@@ -129,8 +134,8 @@ def _death(code: int | None) -> str:
 
 @contextmanager
 def _environment(threads: int) -> Iterator[None]:
-    """What a process started meanwhile finds: OpenMP's threads, one for BLAS, and no Ctrl-C, which is its parent's."""
-    wanted = {"OMP_NUM_THREADS": str(threads)} | dict.fromkeys(ALONE, "1")
+    """What a process started meanwhile finds: `thread_limits`, and no Ctrl-C, which is its parent's."""
+    wanted = thread_limits(threads)
     before = {name: os.environ.get(name) for name in wanted}
     os.environ.update(wanted)
     masks = hasattr(signal, "pthread_sigmask")

@@ -14,7 +14,8 @@ from importlib import import_module
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from ..errors import RecipeError, ResourceError, ScanError
+from ..errors import RecipeError, ResourceError, ScanError, told_by
+from ..files.whole import write_text
 
 MARKS = ("ETag", "etag", "checksum", "md5Hash", "mtime", "LastModified", "last_modified", "created")
 LATEST_S = 2_000_000_000  # a copy's time stands for the mark of what was copied: some second before the year 2033
@@ -110,6 +111,14 @@ class Store:
         """A file that may be gone already."""
         with suppress(FileNotFoundError):
             self._fs.rm_file(f"{self._root}/{name}")
+
+
+def put(out: str, name: str, text: str, *, whatever: bool = False) -> None:
+    """Write a small text file below a path or an address. whatever : as `files.whole.replacing`. Raises as it does."""
+    if is_address(out):
+        Store(out).write(name, text.encode())
+    else:
+        write_text(Path(out) / name, text, whatever=whatever)
 
 
 class Mirror:
@@ -208,5 +217,4 @@ def _refusals(place: str, writing: bool = False) -> Iterator[None]:
         raise
     except Exception as e:
         kind = ResourceError if writing else ScanError
-        cause = " ".join(str(e).split()) or type(e).__name__
-        raise kind(f"the storage refused ({cause})", place=place) from None
+        raise kind(f"the storage refused ({told_by(e)})", place=place) from None

@@ -16,11 +16,11 @@ from urllib.parse import quote
 
 from ..errors import counted
 from ..files.json import plain, to_json
-from ..files.whole import write_text
+from ..files.table import inert
 from ..recipe import Recipe
 from ..version import __version__
 from .job import DONE, FAILED, Row
-from .store import Store, is_address
+from .store import put
 
 TEMPLATE = Path(__file__).with_name("page.html")
 NAME = "batch"
@@ -50,10 +50,7 @@ def write_summary(out: str, recipe: Recipe, threads: int, rows: Sequence[Row]) -
         f"{NAME}.html": page_of(rows, recipe.name),
     }
     for name, text in files.items():
-        if is_address(out):
-            Store(out).write(name, text.encode("utf-8", "backslashreplace"))
-        else:
-            write_text(Path(out) / name, text.encode("utf-8", "backslashreplace").decode())
+        put(out, name, text.encode("utf-8", "backslashreplace").decode())
 
 
 def figure_names(rows: Sequence[Row]) -> list[str]:
@@ -76,10 +73,7 @@ def csv_of(rows: Sequence[Row]) -> str:
 def _cell(value: object) -> object:
     if value is None:
         return ""
-    if isinstance(value, str):
-        line = " ".join(value.split())
-        return f"'{line}" if line[:1] in "=+-@" and line else line
-    return value
+    return inert(" ".join(value.split())) if isinstance(value, str) else value
 
 
 def page_of(rows: Sequence[Row], recipe: str) -> str:

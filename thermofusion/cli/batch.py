@@ -35,7 +35,7 @@ def batch(
     json: Json = False,
 ) -> int:
     """Fuse all scans below a folder; finished ones are left alone, one bad scan never stops the rest."""
-    from ..batch.batch import Crew, Heard, exit_code, memory_per_worker_GiB, place_for, run_batch
+    from ..batch.batch import Crew, exit_code, memory_per_worker_GiB, place_for, run_batch
     from ..batch.scans import find_scans
     from ..batch.store import is_address
 
@@ -53,7 +53,7 @@ def batch(
     )
     note(f"{counted(len(sources), 'scan')}; {who}, {counted(crew.threads, 'thread')} each, {bound}")
     try:
-        rows = run_batch(sources, recipe, out, crew, heard=Heard(_told))
+        rows = run_batch(sources, recipe, out, crew, tell=_told)
     except KeyboardInterrupt:
         note(f"{out}/batch.html shows what is finished")
         raise

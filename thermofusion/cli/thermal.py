@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ..errors import RecipeError, ScanError, counted
+from ..errors import RecipeError, ScanError, counted, placed
 from ..progress import Progress
 from .console import emit, help_alone, low_high, note, progress, spared_file
 from .options import spelled_out
@@ -32,7 +32,6 @@ Raw = Annotated[
 ]
 
 FIELD_MARGIN = 0.1  # of the curve's range: vignetting and noise about a source at its end
-DEFAULT_BAND_UM = (7.5, 13.5)  # where no recording states the camera's
 STILL_SHARE = 0.02  # of a picture may move in a still recording
 
 verbs = typer.Typer(
@@ -185,11 +184,8 @@ def noise(
     if out is not None and out.suffix != ".svg":
         raise RecipeError(f"the plot is written as .svg, not '{out.suffix}'", place=out)
     frames, chosen = _opener(raw, rate)(source), _curve(curve)
-    try:
-        with progress(json) as step:
-            found = still_noise(_read(frames, chosen, step), frames.times_s)
-    except ScanError as e:
-        raise ScanError(e.cause, place=e.place or source, hint=e.hint) from None
+    with placed(source), progress(json) as step:
+        found = still_noise(_read(frames, chosen, step), frames.times_s)
     if out is not None:
         write_text(out, allan_svg(found))
     text = (
@@ -217,17 +213,16 @@ def edge(
     from ..calibration.thermal.noise import edge_spread
     from ..calibration.thermal.scatter import measure_scatter
     from ..physics.band import Band
+    from ..types import ThermalCamera
 
     part = None if box is None else _box(box)
     image, unit = _opener(raw)(source).mean_shown(_curve(curve))
-    try:
+    with placed(source):
         found = edge_spread(image if part is None else part.cut(image))
-    except ScanError as e:
-        raise ScanError(e.cause, place=source, hint=e.hint) from None
     wide = None
     if unit == "degC":
         with suppress(ScanError):  # the rest of the picture need not be an even wall
-            wide = measure_scatter([image], Band(*DEFAULT_BAND_UM)).scatter
+            wide = measure_scatter([image], Band(*ThermalCamera.band_um)).scatter
     text = (
         f"point spread {found.sigma_px:.3f} ± {found.sigma_sigma_px:.3f} px, one sigma (psf_sigma_px in scan.json)\n"
         f"edge {found.contrast:.1f} {'K' if unit == 'degC' else unit} high, slanted by {found.angle_deg:+.1f}°"
@@ -258,14 +253,13 @@ def scatter(
     from ..files.json import to_json
     from ..files.whole import write_text
     from ..physics.band import Band
+    from ..types import ThermalCamera
 
     opened, chosen = [_opener(raw)(s) for s in sources], _curve(curve)
     cameras = [s.scan.thermal.camera for s in opened if s.scan is not None and s.scan.thermal is not None]
-    try:
+    with placed(sources[0]):
         pictures = [s.mean_degC(chosen) for s in opened]
-        found = measure_scatter(pictures, Band(*(cameras[0].band_um if cameras else DEFAULT_BAND_UM)))
-    except ScanError as e:
-        raise ScanError(e.cause, place=e.place or sources[0], hint=e.hint) from None
+        found = measure_scatter(pictures, Band(*(cameras[0] if cameras else ThermalCamera).band_um))
     document = scatter_document(found)
     if rig is not None:
         add_scatter(rig, found.scatter)
@@ -304,10 +298,8 @@ def qualify(
     if out.suffix != ".json":
         raise RecipeError(f"figures are written as .json, not '{out.suffix}'", place=out)
     groups = shown_sources(read_readings(readings), readings, _opener(raw, rate), _curve(curve))
-    try:
+    with placed(readings):
         found = figures(groups, sigma)
-    except ScanError as e:
-        raise ScanError(e.cause, place=e.place or readings, hint=e.hint) from None
     document = {"schema": "thermofusion-qualify/1", "claim": CLAIM, **vars(found)}
     write_text(out, to_json(document) + "\n")
     write_text(out.with_suffix(".html"), qualify_page(found))
@@ -334,11 +326,8 @@ def time_offset(
     from ..scans import open_scan
 
     recording = open_scan(scan, format=format)
-    try:
-        with progress(json) as step:
-            found = scan_time_offset(recording, max_offset_s=max_s, progress=step)
-    except ScanError as e:
-        raise ScanError(e.cause, place=e.place or scan, hint=e.hint) from None
+    with placed(scan), progress(json) as step:
+        found = scan_time_offset(recording, max_offset_s=max_s, progress=step)
     own = 0.0 if recording.thermal is None else recording.thermal.camera.time_offset_s
     value = {"time_offset_s": found.offset_s, "sigma_s": found.sigma_s, "residual_px": found.residual_px}
     value |= {"thermal_frames": found.frames, "scan_time_offset_s": own}

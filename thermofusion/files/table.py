@@ -44,6 +44,11 @@ def table_rows(
         raise ScanError(f"it cannot be read as CSV ({e})", place=f"{path}, line {reader.line_num}") from None
 
 
+def inert(cell: str) -> str:
+    """A cell's text as no spreadsheet runs it: an apostrophe stands before what would be a formula."""
+    return f"'{cell}" if cell[:1] in "=+-@\t\r" and cell else cell
+
+
 class _Lines:
     """A file's lines, for the CSV reader; a quoted cell may run over many, a row not over too many."""
 

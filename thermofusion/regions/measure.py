@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from ..files.table import inert
 from ..types import Bool, BudgetInput, Float, SharedErrors, ThermalMesh, VertexFlag
 from ..version import __version__
 from .body import Body, along
@@ -148,7 +149,7 @@ class Measured:
 def _cell(x: Any) -> str:
     """A number without noise digits, no cell that a spreadsheet would run as a formula."""
     if isinstance(x, str):
-        return f"'{x}" if x[:1] in "=+-@\t\r" and x else x
+        return inert(x)
     return "" if not np.isfinite(x) else f"{x:.6g}"
 
 

@@ -36,7 +36,7 @@ def claimed(folder: Path, scan: Scan, names: list[str], *, overwrite: bool = Fal
     """
     _apart(folder, scan)
     with _locked(folder):
-        left = _listed(folder)
+        left = listed(folder)
         _clear(folder, names)
         if not overwrite:
             _own(folder, scan, names, left)
@@ -46,9 +46,9 @@ def claimed(folder: Path, scan: Scan, names: list[str], *, overwrite: bool = Fal
         yield left
 
 
-def listed(folder: Path) -> list[str]:
-    """The files that a finished result consists of, by its own word; empty without one."""
-    return _listed(folder)
+def complete(folder: Path) -> bool:
+    """Whether a finished result stands there, with all its files."""
+    return (folder / REPORT).is_file() and all((folder / name).is_file() for name in listed(folder))
 
 
 def tidy(folder: Path) -> None:
@@ -131,7 +131,8 @@ def _report(folder: Path) -> dict | None:
     return report if isinstance(report, dict) and "thermofusion" in report else None
 
 
-def _listed(folder: Path) -> list[str]:
+def listed(folder: Path) -> list[str]:
+    """The files that a finished result consists of, by its own word; empty without one."""
     report = _report(folder)
     if report is None:  # killed while it changed over?
         try:

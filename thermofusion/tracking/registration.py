@@ -21,9 +21,7 @@ from .maps import DepthMap
 MAX_NORMAL_DEG = 45.0  # partners must face alike
 MIN_PARTNERS = 150  # a twentieth of a frame's points: fewer fix no pose
 NOISE_FLOOR_M = 3e-4  # at 1 m: no spread of residuals is believed to be smaller
-RANGE_BIAS_1_M = (
-    0.01  # a depth camera's own error grows as z², here at 1 m: what two views have in common of it cancels
-)
+RANGE_BIAS_1_M = 0.01  # a depth camera's own error, as z², here at 1 m: what two views share of it cancels
 REACH_M = 0.05  # of the partners that judge a motion
 INTENSITY_FLOOR = 0.05  # of the normalised intensity, whose local spread is about 1
 
