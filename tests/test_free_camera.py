@@ -117,8 +117,7 @@ def test_where_no_view_shows_the_subject_one_sentence_says_so(recorded):
     # warm things, but nobody of this shape
     blobs = np.kron(rng.integers(0, 2, (6, 8)), np.ones((40, 40))) * 400 + cold
     other = replace(scan, thermal=replace(stream, load=lambda i: np.roll(blobs, 40 * i, 1).astype(np.uint16)))
-    # too few views fit, or from several sides alike: which of the two is seen first hangs on the blobs
-    with pytest.raises(ScanError, match=r"can be placed|from several sides"):
+    with pytest.raises(ScanError, match="can be placed"):
         fuse(other, recipe)
 
 

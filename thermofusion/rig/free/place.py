@@ -168,7 +168,8 @@ def _by_outline(fitter: OutlineFitter, found: Candidates, progress: Progress) ->
         candidates.append([fitter.rough(row, T) for T in starts])
         progress("rig", row + 1, len(found.T_world_thermal))
     placed = walk_through(candidates)
-    if np.median([_margin(p, c) for p, c in zip(placed, candidates, strict=True)]) < AMBIGUOUS:
+    margins = [_margin(p, c) for p, c in zip(placed, candidates, strict=True) if p.cost < MAX_COST]
+    if margins and np.median(margins) < AMBIGUOUS:  # of views that fit: who fits nowhere is no one's double
         raise ScanError(
             "the thermal views could have been taken from several sides: the subject's outline fits from each",
             hint="a round or flat subject has no outline to tell by; record with the thermal camera on the depth rig",
