@@ -25,6 +25,7 @@ from thermofusion.geometry.mesh import (
 from thermofusion.geometry.normals import window_normals
 from thermofusion.recipe import load_recipe
 from thermofusion.surface import surface as fusion
+from thermofusion.surface.clean import subject_only
 from thermofusion.surface.surface import SurfaceResult, depth_poses, fuse_surface
 from thermofusion.surface.tsdf import Frames, depth_noise, integrate_frames, plan_grid, survey_depth
 from thermofusion.types import Camera, Rig, Scan, Stream, Trajectory
@@ -429,3 +430,26 @@ def test_torso_recording_meets_its_bars(shared_data) -> None:
     assert result.mesh.color_rgb is not None
     skin = result.mesh.color_rgb[(result.mesh.color_rgb != 128).any(1)]
     assert len(skin) > 0.8 * len(result.mesh)
+
+
+def test_a_floor_smeared_into_layers_goes_where_tracking_saw_it() -> None:
+    """Poses that hold a swaying body still move the floor under it: no one plane is left of it, its layers all go."""
+    x, y = np.meshgrid(np.linspace(-0.8, 0.8, 81), np.linspace(-0.8, 0.8, 81))
+    n = np.arange(80 * 81).reshape(80, 81)[:, :-1].ravel()
+    sheet = np.concatenate([np.stack([n, n + 1, n + 82], 1), np.stack([n, n + 82, n + 81], 1)])
+    vertices, triangles = [], []
+    for k, z in enumerate((-0.05, -0.02, 0.02, 0.05)):  # about where it was seen
+        vertices.append(np.stack([x, y, np.full_like(x, z)], -1).reshape(-1, 3))
+        triangles.append(sheet + k * x.size)
+    body = np.stack([0.2 * np.cos(np.pi * y), 0.2 * np.sin(np.pi * y), 0.8 + x], -1).reshape(-1, 3)  # a tube
+    vertices, triangles = [*vertices, body], [*triangles, sheet + 4 * x.size]
+    survey = SimpleNamespace(T_world_depth=orbit(12, radius=1.1, height=1.1, target=(0, 0, 0.5)), camera=WIDE, depth=())
+    subject = load_recipe(COARSE).subject
+    soup = np.concatenate(vertices).astype(np.float32), np.concatenate(triangles).astype(np.int32)
+    left = subject_only(*soup, survey, None, subject=subject, floor_plane=np.array([0, 0, 1.0, 0.004]))
+    np.testing.assert_allclose(left.floor_plane, [0, 0, 1, 0], atol=0.021)
+    assert left.vertices_m[:, 2].min() > 0.06
+    assert len(left.vertices_m) > 0.8 * x.size
+    all_of_it = subject.model_copy(update={"background": "keep"})
+    kept = subject_only(*soup, survey, None, subject=all_of_it, floor_plane=np.array([0, 0, 1.0, -0.3]))
+    assert (np.abs(kept.vertices_m[:, 2]) < 0.06).any()  # much lies below what was given: it was no floor

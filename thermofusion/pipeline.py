@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 # A stage is handed exactly the recipe sections that its key holds. It also depends on all stages before it.
 STAGES = (
     Stage("tracking", ("input", "subject", "tracking")),
-    Stage("surface", ("input", "subject", "surface"), edition=4),
+    Stage("surface", ("input", "subject", "surface"), edition=5),
     Stage("rig", ("input", "rig"), edition=3),
     Stage("mapping", ("input", "mapping"), edition=10),
     Stage("temperature", ("mapping", "temperature"), edition=10, handed_out=RESULT),

@@ -19,6 +19,8 @@ from ..types import Float, Float32, Int
 NODES_OF_A_POINT = 4  # the nearest; the fifth's distance is where their weight ends
 NEIGHBOURS = 4  # of a node that hold it, at least
 COARSE_M = 0.012  # ways along the surface are measured between points this far apart
+MAX_NODES = 120  # a body has 60 to 70; a surface with more of everything gets larger pieces, for memory grows with K²
+PIECE_OF_A_NODE = 0.2  # a loose piece of less than this share of a node's own area gets none
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +108,10 @@ def bind(vertices: Float32, triangles: Int, node_m: Float) -> Binding:
 
 
 def _bound(coarse: Coarse, distance: Float) -> Binding:
-    """The binding of a surface's vertices, from distances (K, C) of its coarse points."""
+    """The binding of a surface's vertices, from distances (K, C) of its coarse points.
+
+    What no way leads to from a node (a loose piece) is carried as the point nearest in space that one leads to.
+    """
     order = np.argsort(distance, axis=0, kind="stable")[: NODES_OF_A_POINT + 1]
     near = np.take_along_axis(distance, order, axis=0)
     known = np.isfinite(near)
@@ -114,21 +119,31 @@ def _bound(coarse: Coarse, distance: Float) -> Binding:
     weight = np.where(known, np.clip(1 - near / reach, 0, None) ** 2, 0.0)[:NODES_OF_A_POINT]
     weight[0, weight.sum(0) <= 0] = 1.0
     weight /= weight.sum(0)
-    node = order[:NODES_OF_A_POINT].T.astype(np.int32)
-    return Binding(node, weight.T.astype(np.float32), coarse.of_vertex)
+    node, weight = order[:NODES_OF_A_POINT].T.astype(np.int32), weight.T.astype(np.float32)
+    loose, tied = np.flatnonzero(~known[0]), np.flatnonzero(known[0])
+    if len(loose):
+        beside = tied[cKDTree(coarse.at_m[tied]).query(coarse.at_m[loose])[1]]
+        node[loose], weight[loose] = node[beside], weight[beside]
+    return Binding(node, weight, coarse.of_vertex)
 
 
 def _spread(coarse: Coarse, spacing_m: float) -> tuple[Int, Float]:
-    """Farthest points along the surface until none is farther than `spacing_m` from one: (K,) and distances (K, C)."""
-    n = len(coarse.at_m)
-    start = int(np.lexsort(coarse.at_m.T)[-1])
-    chosen, rows, nearest = [start], [], np.full(n, np.inf)
+    """Farthest points along the surface until none is farther than `spacing_m` from one: (K,) and distances (K, C).
+
+    `MAX_NODES` at most; none on pieces too small to carry one.
+    """
+    _, piece = connected_components(coarse.graph, directed=False)
+    size = np.bincount(piece)
+    carries = size >= min(PIECE_OF_A_NODE * np.pi / 4 * (spacing_m / COARSE_M) ** 2, size.max())
+    able = carries[piece]
+    start = int(np.lexsort((*coarse.at_m.T, able))[-1])
+    chosen, rows, nearest = [start], [], np.where(able, np.inf, 0.0)
     while True:
-        d = dijkstra(coarse.graph, indices=chosen[-1])
+        d = np.asarray(dijkstra(coarse.graph, indices=chosen[-1]))
         rows.append(d)
         nearest = np.minimum(nearest, d)
         far = int(np.argmax(np.where(np.isfinite(nearest), nearest, 1e9)))
-        if nearest[far] <= spacing_m:
+        if nearest[far] <= spacing_m or len(chosen) == MAX_NODES:
             return np.array(chosen, np.int32), np.array(rows)
         chosen.append(far)
 

@@ -238,10 +238,10 @@ class Normal:
         matrix = csr_matrix((products, (row.ravel(), point)), shape=(len(place), P))
         return cls(matrix, place, place % m * m + place // m, m)
 
-    def matrices(self, weight: Float) -> Float:
-        """(F, m, m) Σ w J'J for weights (F, P)."""
-        values = (self.products @ weight.T.astype(np.float32)).T
-        out = np.zeros((len(weight), self.size * self.size))
-        out[:, self.mirror] = values
-        out[:, self.place] = values
-        return out.reshape(-1, self.size, self.size)
+    def matrix(self, weight: Float) -> Float:
+        """(m, m) Σ w J'J for weights (P,)."""
+        values = self.products @ weight.astype(np.float32)
+        out = np.zeros(self.size * self.size)
+        out[self.mirror] = values
+        out[self.place] = values
+        return out.reshape(self.size, self.size)

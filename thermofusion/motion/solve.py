@@ -114,13 +114,17 @@ def solve_motion(
         z[:-1] -= step
         return z
 
-    own, after = normal.matrices(share * sums.own), normal.matrices(share * sums.next)
-    index = np.arange(m)
-    own += held
-    own[:-1, index, index] += flat
-    own[1:, index, index] += flat
-    after[:, index, index] -= flat
-    factored = Tridiagonal.of(own, after)
+    def own(f: int) -> Float:
+        H = normal.matrix(share * sums.own[f]) + held
+        H[np.diag_indices(m)] += flat[max(f - 1, 0) : f + 1].sum(0)
+        return H
+
+    def after(f: int) -> Float:
+        H = normal.matrix(share * sums.next[f])
+        H[np.diag_indices(m)] -= flat[f]
+        return H
+
+    factored = Tridiagonal.of(F, own, after)
     pull = share * (sums.pull - seen / share * (sums.weight * sums.residual * share / total))
     b = (J.T @ pull.T).T - regular(old)
     x, taken = _conjugate_gradients(lambda v: (J.T @ data(v).T).T + regular(v), b, factored)
@@ -154,17 +158,18 @@ class Tridiagonal:
     below: list[Float32]
 
     @classmethod
-    def of(cls, own: Float, after: Float) -> Tridiagonal:
-        """own : (F, m, m) on the diagonal. after : (F-1, m, m) right of it."""
+    def of(cls, count: int, own: Callable[[int], Float], after: Callable[[int], Float]) -> Tridiagonal:
+        """own(f) : (m, m) on the diagonal, f < count. after(f) : right of it, f < count - 1. Asked for one by one, for
+        only the factors are kept."""
         lower, below = [], []
-        block = own[0]
-        for f in range(len(own)):
+        block = own(0)
+        for f in range(count):
             L = cholesky(block.astype(np.float32), lower=True, check_finite=False)
             lower.append(L)
-            if f + 1 < len(own):
-                B = solve_triangular(L, after[f].astype(np.float32), lower=True, check_finite=False)
+            if f + 1 < count:
+                B = solve_triangular(L, after(f).astype(np.float32), lower=True, check_finite=False)
                 below.append(B)
-                block = own[f + 1] - B.T @ B
+                block = own(f + 1) - B.T @ B
         return cls(lower, below)
 
     def solve(self, b: Float) -> Float:

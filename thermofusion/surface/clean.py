@@ -9,15 +9,23 @@ import numpy as np
 from ..geometry.camera import project
 from ..geometry.manifold import manifold
 from ..geometry.mesh import components, keep_vertices, mesh_normals, vertex_areas
-from ..geometry.plane import floor_in_surface, refine_floor
+from ..geometry.plane import (
+    FLOOR_BELOW_FRACTION,
+    FLOOR_MIN_AREA_M2,
+    FLOOR_NORMAL_COS,
+    floor_in_surface,
+    refine_floor,
+)
 from ..geometry.rigid import invert, transform_points
 from ..recipe import SubjectSection
+from ..robust import weighted_quantile
 from ..types import Float, Float32, Int
 from .tsdf import GridPlan, Survey
 
 SEEN_TRUNCATIONS = 2.0  # a vertex is on a frame's surface if nearer to it than this, in truncations
 VOTE_SHARE = 0.05  # of what a frame sees; less is a hand in front or a chair's leg
 MAX_PLANES = 3  # a floor and two walls
+SMEAR_M, SMEARED_BELOW = 0.1, 0.98  # poses are against the body: under one that sways the floor is fused as layers
 
 
 @dataclass(frozen=True)
@@ -57,14 +65,18 @@ def subject_only(
     removed, messages = [], []
     floor: Float | None = None
     walls: list[Float] = []
+    clearance_m = floor_top_m = subject.floor_clearance_mm / 1e3
     if subject.floor != "keep":
-        floor, walls = _planes(vertices, triangles, survey, subject.floor_clearance_mm / 1e3, floor_plane)
+        if floor_plane is not None:
+            floor, thick_m = _given_floor(vertices, triangles, survey, np.asarray(floor_plane, np.float64))
+            floor_top_m += thick_m
+        floor, walls = _planes(vertices, triangles, survey, (clearance_m, floor_top_m), floor)
         if floor is None and subject.floor == "remove":
             messages.append("no floor plane was found, none was removed")
-    planes = [("floor", floor)] if floor is not None else []
-    planes += [("wall", w) for w in walls] if subject.background == "remove" else []
-    for reason, plane in planes:
-        stays = _height(plane, vertices) >= subject.floor_clearance_mm / 1e3
+    planes = [("floor", floor, floor_top_m)] if floor is not None else []
+    planes += [("wall", w, clearance_m) for w in walls] if subject.background == "remove" else []
+    for reason, plane, top_m in planes:
+        stays = _height(plane, vertices) >= top_m
         removed.append(RemovedPart(reason, 1e4 * float(vertex_areas(vertices, triangles)[~stays].sum()), 1))
         vertices, triangles = keep_vertices(vertices, triangles, stays)
     vertices, triangles, others = _pieces(vertices, triangles, survey, plan, subject)
@@ -75,18 +87,36 @@ def _height(plane: Float, points: Float32) -> Float32:
     return points @ plane[:3].astype(np.float32) + np.float32(plane[3])
 
 
+def _given_floor(vertices: Float32, triangles: Int, survey: Survey, plane: Float) -> tuple[Float | None, float]:
+    """The floor that tracking saw, refined on the surface, and how far above it m its layers reach; None: it is none.
+
+    Frame by frame it is flat; fused at poses that hold a swaying body still, it is smeared over centimetres.
+    """
+    areas, normals = vertex_areas(vertices, triangles), mesh_normals(vertices, triangles)
+    eyes = survey.T_world_depth[:, :3, 3]
+    refined = refine_floor(vertices, normals, areas, eyes, plane)
+    if refined is not None:
+        return refined, 0.0
+    height = _height(plane, vertices)
+    on = (np.abs(height) < SMEAR_M) & (normals @ plane[:3].astype(np.float32) > FLOOR_NORMAL_COS)
+    below = areas[height < -SMEAR_M].sum() > FLOOR_BELOW_FRACTION * areas.sum()
+    if below or areas[on].sum() < FLOOR_MIN_AREA_M2:
+        return None, 0.0
+    middle, top = (weighted_quantile(height[on], areas[on], q) for q in (0.5, SMEARED_BELOW))
+    return np.append(plane[:3], plane[3] - middle), top - middle
+
+
 def _planes(
-    vertices: Float32, triangles: Int, survey: Survey, clearance_m: float, floor: Float | None
+    vertices: Float32, triangles: Int, survey: Survey, tops_m: tuple[float, float], floor: Float | None
 ) -> tuple[Float | None, list[Float]]:
     """The floor (given or found), and other planes that bound the scene: walls.
 
-    Of several planes the floor is the one that faces up as the cameras were held.
+    Of several planes the floor is the one that faces up as the cameras were held. tops_m : up to where a plane and the
+    floor given reach.
     """
     areas, normals = vertex_areas(vertices, triangles), mesh_normals(vertices, triangles)
     eyes, up = survey.T_world_depth[:, :3, 3], -survey.T_world_depth[:, :3, 1].mean(0)
     found: list[Float] = []
-    if floor is not None:
-        floor = refine_floor(vertices, normals, areas, eyes, np.asarray(floor, np.float64))
     plane = floor
     for _ in range(MAX_PLANES):
         if plane is None:
@@ -94,7 +124,7 @@ def _planes(
         if plane is None:
             break
         found.append(plane)
-        rest = _height(plane, vertices) >= clearance_m
+        rest = _height(plane, vertices) >= tops_m[plane is floor]
         vertices, normals, areas, plane = vertices[rest], normals[rest], areas[rest], None
     if floor is None and found:
         floor = max(found, key=lambda p: float(p[:3] @ up))
