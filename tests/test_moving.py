@@ -7,10 +7,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from support.walkround import ellipsoid, walk
 
 from thermofusion.geometry._open3d import o3d
 from thermofusion.geometry.camera import pixel_rays
+from thermofusion.geometry.outline import OutlineCaster, project_contour
 from thermofusion.geometry.rigid import invert, se3_exp, transform_points
 from thermofusion.motion.body import moved_by
 from thermofusion.motion.estimate import STILL, estimate, look_points
@@ -21,7 +23,7 @@ from thermofusion.motion.parts import name_parts
 from thermofusion.motion.rest import unrest
 from thermofusion.motion.rows import CoarseFrames
 from thermofusion.motion.solve import Tridiagonal
-from thermofusion.motion.told import ranges
+from thermofusion.motion.told import amplitudes, ranges
 from thermofusion.motion.warp import RestSurface, Warp
 from thermofusion.phantom.scene import ShapeConfig
 from thermofusion.phantom.shapes import build_shape
@@ -197,3 +199,37 @@ def test_parts_are_named_by_place():
     assert middle["head"][2] > middle["chest"][2] > middle["belly"][2] > middle["pelvis"][2]
     reach = [np.abs(middle[f"left {k}"][0]) for k in ("upper arm", "forearm", "hand")]
     assert reach == sorted(reach)
+
+
+def test_amplitudes_are_the_rms_of_displacements(body):
+    graph = build_graph(body.vertices_m, body.triangles, 0.15)
+    twist = np.random.default_rng(3).normal(0, [0.03] * 3 + [0.008] * 3, (5, len(graph), 6))
+    field = MotionField(graph.at_m, np.arange(5.0), twist)
+    far = [displacement(body.vertices_m, graph.binding, graph.at_m, t) for t in twist]
+    rms = np.sqrt((np.array(far) ** 2).sum(2).mean(0))
+    np.testing.assert_allclose(amplitudes(body, field, graph.binding), rms, rtol=1e-3)
+
+
+def test_an_outline_is_carried_along_to_where_the_moved_body_shows_it(body):
+    """Cast at rest and carried, it lies where one lies that is cast from the body as it leans."""
+    camera = Camera(320, 240, np.array([[280.0, 0, 159.5], [0, 280, 119.5], [0, 0, 1]]))
+    share = np.clip(body.vertices_m[:, 2:] / 0.2, 0, 1)
+    share = share * share * (3 - 2 * share)
+    turn = np.zeros((len(body), 3))
+    turn[:, :1] = share * np.radians(3.0)
+    R = rotations(turn)
+    at, normals = (
+        np.einsum("vij,vj->vi", R, x.astype(np.float64)).astype(np.float32) for x in (body.vertices_m, body.normals)
+    )
+    leans = replace(body, vertices_m=at, normals=normals)
+    for T in walk(12.0, tremor=0.0).T_world_depth[::30]:
+        caster, T_camera_world = OutlineCaster(body, camera), invert(T)
+        true = project_contour(camera, T_camera_world, OutlineCaster(leans, camera).contour(T))
+        off = {}
+        for name, contour in (("carried", caster.posed(leans).contour(T)), ("left", caster.contour(T))):
+            uv = project_contour(camera, T_camera_world, contour).uv_px
+            distance, nearest = cKDTree(true.uv_px).query(uv)
+            across = np.einsum("ni,ni->n", uv - true.uv_px[nearest], true.normal_px[nearest])
+            off[name] = np.percentile(np.abs(across[distance < 5]), 95)
+        assert off["carried"] < 0.2
+        assert off["left"] > 3 * off["carried"]

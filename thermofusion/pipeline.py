@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 STAGES = (
     Stage("tracking", ("input", "subject", "tracking")),
     Stage("surface", ("input", "subject", "surface"), edition=5),
-    Stage("rig", ("input", "rig"), edition=3),
-    Stage("mapping", ("input", "mapping"), edition=10),
+    Stage("rig", ("input", "rig"), edition=4),
+    Stage("mapping", ("input", "mapping"), edition=11),
     Stage("temperature", ("mapping", "temperature"), edition=10, handed_out=RESULT),
 )
 STAGE_NAMES = tuple(stage.name for stage in STAGES)

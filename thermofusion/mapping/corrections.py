@@ -14,7 +14,7 @@ import numpy as np
 
 from ..geometry.patches import patches
 from ..geometry.rigid import invert, se3_exp
-from ..motion.body import BodyMotion, mesh_at
+from ..motion.body import BodyMotion, Standing
 from ..progress import Progress, silent
 from ..rig.outlines import OutlineResidual, OutlineView, measure_outline, reach_px, read_outlines, weights_about_median
 from ..robust import mad_sigma
@@ -71,7 +71,7 @@ def view_corrections(
     poses = views.T_world_thermal
     outlines, contrast = read_outlines(
         stream,
-        mesh_at(mesh, body, views.times_s),
+        Standing(mesh, body, views.times_s),
         views.frame.tolist(),
         poses,
         lambda _, done, total: progress("mapping", done, total),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -61,11 +60,17 @@ def moved_by(mesh: SurfaceMesh, M: Float32) -> SurfaceMesh:
     return replace(mesh, vertices_m=at, normals=normal)
 
 
-def mesh_at(mesh: SurfaceMesh, motion: BodyMotion | None, times_s: Float) -> Callable[[int], SurfaceMesh]:
-    """Row -> the surface as it stands at times_s[row] (N,) on the depth clock; always `mesh` for a subject at rest."""
-    if motion is None:
-        return lambda _: mesh
-    return lambda row: motion.posed(mesh, float(times_s[row]))
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """Row -> the surface as it stands at times_s[row] (N,) on the depth clock; always `rest` for a subject at rest."""
+
+    rest: SurfaceMesh
+    motion: BodyMotion | None
+    times_s: Float
+
+    def __call__(self, row: int) -> SurfaceMesh:
+        """At the time of a row."""
+        return self.rest if self.motion is None else self.motion.posed(self.rest, float(self.times_s[row]))
 
 
 def parted(path: Trajectory | BodyMotion) -> tuple[Trajectory, BodyMotion | None]:

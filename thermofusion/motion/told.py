@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
+
 import numpy as np
+from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from ..types import Bool, Float, Float32, SurfaceMesh, Trajectory
 from .body import BodyMotion, PartMotion
 from .estimate import Solution
-from .field import MotionField, displacement
+from .field import MotionField, affine
 from .graph import Binding
 from .parts import name_parts
 
@@ -19,26 +23,45 @@ LEAST_BAD = 3  # such frames of those left out, in a row
 
 def amplitudes(mesh: SurfaceMesh, field: MotionField, binding: Binding) -> Float32:
     """(V,) m, rms over the knots of how far each vertex is from where it is at rest."""
-    squares = np.zeros(len(mesh))
+    squares = np.zeros((len(binding.node), 4, 4))  # of p -> D (p, 1), summed: one quadratic form of p
+    for D in _of_groups(field, binding):
+        squares += np.einsum("gij,gik->gjk", D, D)
+    p = _homogeneous(mesh)
+    far2 = np.einsum("vj,vjk,vk->v", p, squares[binding.group], p)
+    return np.sqrt(np.maximum(far2, 0) / len(field.knot_s)).astype(np.float32)
+
+
+def _of_groups(field: MotionField, binding: Binding) -> Iterator[Float]:
+    """Knot by knot (G, 3, 4): D (p, 1) is how far a vertex p of each group of the binding is displaced, m."""
+    alike = replace(binding, group=np.arange(len(binding.node), dtype=np.int32))
     for twist in field.twist:
-        d = displacement(mesh.vertices_m, binding, field.node_m, twist)
-        squares += np.einsum("vi,vi->v", d, d)
-    return np.sqrt(squares / len(field.knot_s)).astype(np.float32)
+        D = affine(field.node_m, twist, alike).astype(np.float64)
+        D[:, [0, 1, 2], [0, 1, 2]] -= 1
+        yield D
+
+
+def _homogeneous(mesh: SurfaceMesh) -> Float:
+    return np.concatenate([mesh.vertices_m, np.ones((len(mesh), 1))], axis=1, dtype=np.float64)
 
 
 def part_motions(mesh: SurfaceMesh, field: MotionField, binding: Binding, up: Float) -> tuple[PartMotion, ...]:
     """How far the middle of every part moved against the trunk, parts named by place. up : (3,) unit."""
     names, part = name_parts(mesh, up)
-    mean = np.zeros((len(field.knot_s), len(names), 3))
-    count = np.maximum(np.bincount(part[part >= 0], minlength=len(names)), 1)
     inside = np.flatnonzero(part >= 0)
-    for f, twist in enumerate(field.twist):
-        d = displacement(mesh.vertices_m[inside], binding.take(inside), field.node_m, twist)
-        mean[f] = np.stack([np.bincount(part[inside], d[:, k], len(names)) for k in range(3)], axis=1) / count[:, None]
+    count = np.bincount(part[inside], minlength=len(names))
+    groups = len(binding.node)
+    pair, of = np.unique(part[inside] * groups + binding.group[inside], return_inverse=True)
+    p = _homogeneous(mesh)[inside]
+    total = np.stack(
+        [np.bincount(of, p[:, k]) for k in range(4)], axis=1
+    )  # of a part's vertices that are carried alike
+    share = csr_matrix((np.ones(len(pair)), (pair // groups, np.arange(len(pair)))), shape=(len(names), len(pair)))
+    moved = [np.einsum("aij,aj->ai", D[pair % groups], total) for D in _of_groups(field, binding)]
+    mean = np.array([share @ m for m in moved]) / np.maximum(count, 1)[:, None]
     mean -= mean.mean(0)
     far = 1e3 * np.linalg.norm(mean, axis=2)
     rms = np.sqrt((far**2).mean(0))
-    seen = np.bincount(part[inside], minlength=len(names)) > 0
+    seen = count > 0
     return tuple(
         PartMotion(n, round(float(r), 2), round(float(p), 2))
         for n, r, p, s in zip(names, rms, far.max(0), seen, strict=True)

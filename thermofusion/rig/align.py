@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from ..errors import ScanError
 from ..geometry.rigid import interpolate_trajectory, invert
-from ..motion.body import BodyMotion, mesh_at, parted
+from ..motion.body import BodyMotion, Standing, parted
 from ..progress import Progress, silent
 from ..recipe import InputSection, RigSection
 from ..robust import evenly
@@ -50,7 +50,7 @@ from .free.place import FreeViews, place_views
 from .jitter import frame_times
 from .outlines import read_outlines, search_shift
 
-BodyAt = Callable[[Float], Callable[[int], SurfaceMesh]]  # times, s -> row -> the subject as it stood then
+BodyAt = Callable[[Float], Standing]  # times, s -> the subject as it stood then
 MAX_VIEWS = 30  # that enter: more cost time and say nothing new
 MIN_VIEWS = 6
 HELD_SHARE = 0.7  # a sigma this near to its prior's is the prior's
@@ -139,9 +139,9 @@ def align(
     frames = _frames(stream, trajectory, input.max_pose_gap_ms / 1e3)
     T_world_depth, _ = interpolate_trajectory(trajectory, stream.depth_times_s[frames])
     T_world_thermal = T_world_depth @ invert(start.T_thermal_depth)
-    body_at = partial(mesh_at, mesh, body)
-    mesh_of = body_at(stream.depth_times_s[frames])
-    outlines, contrast = read_outlines(stream, mesh_of, frames.tolist(), T_world_thermal, progress)
+    body_at = partial(Standing, mesh, body)
+    stands = body_at(stream.depth_times_s[frames])
+    outlines, contrast = read_outlines(stream, stands, frames.tolist(), T_world_thermal, progress)
     if len(outlines) < MIN_VIEWS:
         return _unchanged(camera, f"fewer than {MIN_VIEWS} thermal views show an outline that could be used")
     begin = camera
@@ -152,7 +152,7 @@ def align(
             turned = start.moved(np.concatenate([rotation, np.zeros(6)]))
             begin = replace(camera, T_thermal_depth=turned.T_thermal_depth)
             T_world_thermal = T_world_depth @ invert(begin.T_thermal_depth)
-            outlines, contrast = read_outlines(stream, mesh_of, frames.tolist(), T_world_thermal, progress)
+            outlines, contrast = read_outlines(stream, stands, frames.tolist(), T_world_thermal, progress)
     if contrast is None or len(outlines) < MIN_VIEWS:
         return _unchanged(camera, "the outline does not stand out from the background in the thermal images")
     times_s = stream.times_s[frames[[v.row for v in outlines]]]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from ..geometry.outline import Contour, OutlineCaster, project_contour
 from ..geometry.rigid import invert
+from ..motion.body import Standing
 from ..physics.signal import SignalConverter
 from ..progress import Progress, silent
 from ..robust import TUKEY, mad_sigma, tukey_weight
-from ..types import Camera, Float, Float32, SurfaceMesh, ThermalStream
+from ..types import Camera, Float, Float32, ThermalStream
 from .edges import find_edges, smooth_image
 
 MAX_POINTS = 400  # contour points used in a view
@@ -74,21 +75,21 @@ class OutlineResidual:
 
 def read_outlines(
     stream: ThermalStream,
-    mesh_of: Callable[[int], SurfaceMesh],
+    body: Standing,
     frames: Sequence[int],
     T_world_thermal: Float,
     progress: Progress = silent,
 ) -> tuple[tuple[OutlineView, ...], Contrast | None]:
     """Images and model outlines of thermal frames at poses (N, 4, 4), and how the outline shows in them.
 
-    mesh_of : row among the frames -> the subject's surface as it stood then. The contrast is None where nothing stands
+    body : the subject's surface at each of the frames. The contrast is None where nothing stands
     out. Raises ScanError for an image that cannot be read.
     """
     lens = stream.camera.lens
-    converter, caster = SignalConverter(stream.camera), OutlineCaster(mesh_of(0), lens)
+    converter, caster = SignalConverter(stream.camera), OutlineCaster(body.rest, lens)
     views: list[OutlineView] = []
     for row, frame in enumerate(frames):
-        contour = caster.posed(mesh_of(row)).contour(T_world_thermal[row])
+        contour = caster.posed(body(row)).contour(T_world_thermal[row])
         if len(contour) >= MIN_POINTS_OF_VIEW:
             radiance = converter.radiance(stream.load(int(frame)), stream.places[frame])
             views.append(OutlineView.of(row, smooth_image(radiance), contour, T_world_thermal[row]))
