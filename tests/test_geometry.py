@@ -155,3 +155,24 @@ def test_gradient_of_a_plane_and_of_noise():
     assert np.median(edge_gradient(vertices, triangles, noise)[inner]) < 0.3 * np.sqrt(2) * 0.01 / 3e-3
     holed = np.where(x > 0.06, np.nan, 10 * x)
     assert np.isfinite(edge_gradient(vertices, triangles, holed)).all()
+
+
+def test_points_along_the_curve_cover_a_surface_evenly_in_whatever_order_they_stand():
+    from thermofusion.geometry.patches import along_curve
+
+    rng = np.random.default_rng(5)
+    sphere = rng.normal(size=(20_000, 3))
+    sphere *= 0.5 / np.linalg.norm(sphere, axis=1, keepdims=True)
+    drawn = sphere[along_curve(sphere, 1e-5)[::20]]
+    shuffled = sphere[rng.permutation(len(sphere))]
+    np.testing.assert_array_equal(shuffled[along_curve(shuffled, 1e-5)[::20]], drawn)
+
+    def counts(points):  # in cubes of 20 cm
+        return np.bincount(np.ravel_multi_index(((points + 0.6) / 0.2).astype(int).T, (6, 6, 6)), minlength=216)
+
+    expected = counts(sphere) / 20
+
+    def uneven(points):
+        return np.mean((counts(points) - expected)[expected > 3] ** 2 / expected[expected > 3])
+
+    assert uneven(drawn) < 0.5 * uneven(sphere[rng.choice(len(sphere), 1000, replace=False)])

@@ -36,7 +36,7 @@ STAGES = (
     Stage("surface", ("input", "subject", "surface"), edition=5),
     Stage("rig", ("input", "rig"), edition=4),
     Stage("mapping", ("input", "mapping"), edition=11),
-    Stage("temperature", ("mapping", "temperature"), edition=10, handed_out=RESULT),
+    Stage("temperature", ("mapping", "temperature"), edition=11, handed_out=RESULT),
 )
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
 KEPT_DEPTH_BYTES, KEPT_THERMAL_BYTES = 256 << 20, 64 << 20  # of images that are not decoded twice

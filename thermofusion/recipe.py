@@ -175,7 +175,7 @@ class CrosscalSection(_Section):
     shape: bool = Field(True, description="the shape of ε(θ), where the overlap carries it")
     gain: bool = Field(False, description="one gain of the camera, where references carry it")
     surroundings: bool = Field(True, description="the body's own radiation, reflected in folds")
-    max_vertices: int = Field(20_000, ge=1000, le=10_000_000, description="vertices the solver uses; all are mapped")
+    max_vertices: int = Field(40_000, ge=1000, le=10_000_000, description="vertices the solver uses; all are mapped")
 
 
 class TemperatureSection(_Section):

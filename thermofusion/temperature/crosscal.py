@@ -24,6 +24,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.special import chdtri, stdtrit
 
 from ..errors import ScanError
+from ..geometry.patches import along_curve
 from ..physics.emissivity import AngleTable, EmissivityModel, reshaped, shape_direction
 from ..physics.equation import without_gain
 from ..robust import MAD_PER_SIGMA, NORMAL_95
@@ -44,6 +45,7 @@ GAIN_SPAN_K = 3.0  # references must differ by this much to carry a gain
 ROWS_PER_VERTEX = 20  # bound on the system: max_vertices x this many observations
 SUPPORT_CELLS = 24  # across the image; the field is known in those that hold so many rows of so many views
 SUPPORT_ROWS, SUPPORT_VIEWS = 25, 3
+CURVE_M = 1e-5  # cubes of the curve along which vertices are drawn: no two vertices share one
 MIN_SHARED = 20  # vertices that two views must share to count as overlapping
 SENSOR_MODES = 48  # of the covariance, where a sensor's pattern is in it: its errors are many and small
 READINGS_ALIKE = 0.01  # chance below which references' scatter is no chance
@@ -206,7 +208,10 @@ def _settled(problem: ThermalProblem) -> tuple[OverlapSystem, Solution, Observat
 
 
 def _choose(observations: Observations, problem: ThermalProblem) -> Observations:
-    """Observations under the angle limit of an even sample of the vertices that two or more views saw."""
+    """Observations under the angle limit of vertices that two or more views saw, drawn evenly over the surface.
+
+    Drawn by place, not by number: the same surface gives the same sample, in whatever order its vertices stand.
+    """
     max_vertices = problem.settings.crosscal.max_vertices
     usable = observations.cos_angle >= np.float32(np.cos(np.radians(problem.mapping.max_angle_deg)))
     usable &= np.isfinite(observations.radiance)
@@ -217,9 +222,10 @@ def _choose(observations: Observations, problem: ThermalProblem) -> Observations
             "no spot of the surface was seen well by two thermal views",
             hint="cross-calibration needs overlap: choose another temperature.method",
         )
-    stride = max(-(-len(shared) // max_vertices), -(-int(count[shared].sum()) // (max_vertices * ROWS_PER_VERTEX)))
+    size = min(len(shared), max_vertices, int(max_vertices * ROWS_PER_VERTEX / count[shared].mean()) + 1)
+    even = np.linspace(0, len(shared) - 1, size).round().astype(np.intp)
     wanted = np.zeros(len(problem), bool)
-    wanted[shared[::stride]] = True
+    wanted[shared[along_curve(problem.points_m[shared], CURVE_M)[even]]] = True
     for contact in problem.contacts:
         wanted[contact.vertices] = True
     return observations.select(usable & wanted[observations.vertex])

@@ -22,6 +22,7 @@ from .references import ExpectedReading
 from .sensor.field import ImageField
 
 HUBER_STEPS, TUKEY_STEPS = 4, 40
+COARSE_VERTICES = 5000  # enough for a first estimate
 CONVERGED_K = 1e-4  # a hundredth of what any result is good to
 SENSOR_CONVERGED_K = 2e-3  # of a single pixel's or column's part: a vertex's mean knows a tenth of it
 OFFSET_PRIOR_K = 5.0  # spread of offsets about their mean: only matters for views that overlap with none
@@ -169,33 +170,45 @@ class OverlapSystem:
     def sample(self, solution: Solution, size: int) -> tuple[OverlapSystem, Solution, NDArray[np.intp]]:
         """Some `size` of the vertices evenly, and those under contact thermometers, with their solution; and which rows
         these are, (N',)."""
+        chosen = self._even(size)
+        rows = np.flatnonzero(chosen[self.vertex])
+        return self._of(chosen), replace(solution, x=solution.x[chosen], weight=solution.weight[rows]), rows
+
+    def _even(self, size: int) -> Bool:
+        """(V,) mask of some `size` vertices, and those under contact thermometers."""
         chosen = np.arange(self.n_vertices) % max(1, -(-self.n_vertices // size)) == 0
         for contact in self.contacts:
             chosen[contact.vertices] = True
-        rows = np.flatnonzero(chosen[self.vertex])
+        return chosen
+
+    def _of(self, chosen: Bool) -> OverlapSystem:
+        """The system of chosen vertices (V,), numbered anew."""
         number = np.cumsum(chosen) - 1
         part = self.part(chosen[self.vertex])
         count = np.bincount(number[part.vertex], minlength=int(chosen.sum()))
-        part = replace(
+        return replace(
             part,
             vertex=number[part.vertex].astype(np.int32),
             start=np.insert(np.cumsum(count), 0, 0).astype(np.int32),
             contacts=tuple(replace(c, vertices=number[c.vertices].astype(np.int32)) for c in self.contacts),
             correlated=max(1.0, self.correlated * float(chosen.mean())),
         )
-        return part, replace(solution, x=solution.x[chosen], weight=solution.weight[rows]), rows
 
     # ---------------------------------------------------------------- iteration
 
     def solve(self, start: Solution | None = None, steps: int = TUKEY_STEPS) -> Solution:
         """Iteratively reweighted least squares: Huber to a first estimate, weighted medians per vertex, then Tukey.
+        Of many vertices some find the first estimate alone.
 
         start : of the same rows without the sensor's pattern; Tukey's weights go on from there, for some `steps`.
         """
         at = self.layout
         p = np.zeros(at.size)
         columns = np.column_stack([self.patterns, np.zeros(len(self.y)), self.gain_column])
-        if start is None:
+        if start is None and self.n_vertices > 2 * COARSE_VERTICES:
+            p, n = self._of(self._even(COARSE_VERTICES)).solve().p, HUBER_STEPS
+            x = self._medians(p)
+        elif start is None:
             x, n = np.bincount(self.vertex, self.y) / np.diff(self.start), 0
         else:
             p[: len(start.p)], x, n = start.p, start.x, HUBER_STEPS
