@@ -29,6 +29,7 @@ from .version import __version__
 
 if TYPE_CHECKING:
     from .report.casts import Cast
+    from .tracking.ahead import Ahead
 
 # A stage is handed exactly the recipe sections that its key holds. It also depends on all stages before it.
 STAGES = (
@@ -39,7 +40,7 @@ STAGES = (
     Stage("temperature", ("mapping", "temperature"), edition=11, handed_out=RESULT),
 )
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
-KEPT_DEPTH_BYTES, KEPT_THERMAL_BYTES = 256 << 20, 64 << 20  # of images that are not decoded twice
+KEPT_THERMAL_BYTES = 64 << 20  # of images that are not decoded twice
 
 
 def fuse(
@@ -62,10 +63,28 @@ def fuse(
 
     Raises ScanError (unusable input), RecipeError, ResourceError. What was computed before an error stays in `out`.
     """
-    if scan.thermal is not None:  # five rooms look at the same images
-        scan = replace(scan, thermal=scan.thermal.kept(KEPT_THERMAL_BYTES))
+    return _written(_Run(scan, recipe, None if out is None else Path(out), progress, redo_from, until), overwrite)
+
+
+def go_on(
+    scan: Scan,
+    recipe: Recipe,
+    ahead: Ahead | None,
+    *,
+    out: Path,
+    progress: Progress = silent,
+    overwrite: bool = False,
+) -> Result:
+    """`fuse` a recording that was followed. ahead : what was done of it meanwhile (`live.follow`); used up."""
+    run = _Run(scan, recipe, out, progress)
+    run.ahead = ahead
+    return _written(run, overwrite)
+
+
+def _written(run: _Run, overwrite: bool) -> Result:
+    """The result of a run, in its folder if it has one."""
+    scan, recipe = run.scan, run.recipe
     verify(scan)
-    run = _Run(scan, recipe, None if out is None else Path(out), progress, redo_from, until)
     if run.folder is None:
         return run.result()
     with claimed(run.folder, scan, names_of(recipe), overwrite=overwrite) as left:
@@ -73,6 +92,17 @@ def fuse(
         finished = None if result.mapped is None else (STAGES[-1].file, run.stages.note)
         write_result(result, recipe, run.folder, left, run.casts, finished)
         return result
+
+
+def ready() -> None:
+    """Load what the stages need and load only when they are called: there is time while a recording is followed."""
+    from .geometry import _open3d  # noqa: F401
+    from .mapping.observe import observe  # noqa: F401
+    from .report.pictures import cast_surface  # noqa: F401
+    from .rig.align import align  # noqa: F401
+    from .surface.surface import fuse_surface  # noqa: F401
+    from .temperature.solve import solve  # noqa: F401
+    from .tracking.track import locate  # noqa: F401
 
 
 def plan(scan: Scan, recipe: Recipe, out: Path, *, redo_from: str | None = None) -> list[StagePlan]:
@@ -110,7 +140,10 @@ class _Run:
         redo_from: str | None = None,
         until: str | None = None,
     ) -> None:
-        self.scan, self.recipe, self.folder, self.progress = scan, recipe, folder, progress
+        self.recipe, self.folder, self.progress = recipe, folder, progress
+        # five rooms look at the same images
+        self.scan = scan if scan.thermal is None else replace(scan, thermal=scan.thermal.kept(KEPT_THERMAL_BYTES))
+        self.ahead: Ahead | None = None
         self.first_anew, self.last = _position(redo_from, len(STAGES)), _position(until, len(STAGES) - 1)
         self.stages = Stages(folder, {"thermofusion": __version__, "scan": fingerprint(scan)}, recipe)
         self.casts: Future[list[Cast]] | None = None
@@ -132,7 +165,7 @@ class _Run:
 
     def steps(self) -> Steps:
         """The method: the paper's four steps."""
-        from .depth.filter import DepthFrames
+        from .depth.filter import KEPT_BYTES, DepthFrames
         from .mapping.observe import observe
         from .rig.align import align
         from .surface.surface import fuse_surface
@@ -141,10 +174,12 @@ class _Run:
 
         scan, step = self.scan, self.step
         # 1. Surface
-        depth = DepthFrames(scan, self.recipe.input, keep_bytes=KEPT_DEPTH_BYTES)
-        tracking = step("tracking", partial(locate, scan, depth=depth))
+        ahead, self.ahead = self.ahead, None
+        depth = None if ahead is None else ahead.depth_frames(scan, self.recipe.input)
+        depth = DepthFrames(scan, self.recipe.input, keep_bytes=KEPT_BYTES) if depth is None else depth
+        tracking = step("tracking", partial(locate, scan, depth=depth, ahead=ahead))
         surface = step("surface", partial(fuse_surface, scan, tracking, depth=depth))
-        del depth  # with the images that it kept
+        del depth, ahead  # with the images that they kept
         if surface is None:
             return Steps(tracking)
         mesh, path, window_m = surface.mesh, surface.path(tracking.trajectory), surface.normal_window_m

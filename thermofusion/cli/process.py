@@ -40,17 +40,22 @@ def run(
 
     renamed: list[str] = []  # told last: before the work, errors speak
     chosen = processing.load(renamed.append)
+    ahead = None
     if follow:
         from .live import followed
 
-        followed(recording.scan, chosen)
+        ahead = followed(recording.scan, chosen)
     scan = recording.open()
     if dry_run:
         plans = pipeline.plan(scan, chosen, out, redo_from=from_)
         emit(plans, "\n".join(f"{p.name:<12} {'reuse' if p.reuse else 'compute'}  ({p.why})" for p in plans), json)
         return 0
     with progress(json) as step:
-        result = pipeline.fuse(scan, chosen, out=out, progress=step, redo_from=from_, until=until, overwrite=overwrite)
+        if from_ is None and until is None:
+            result = pipeline.go_on(scan, chosen, ahead, out=out, progress=step, overwrite=overwrite)
+        else:
+            ways = {"redo_from": from_, "until": until}
+            result = pipeline.fuse(scan, chosen, out=out, progress=step, **ways, overwrite=overwrite)
     emit(result.report, pipeline.summary(result.report, out), json)
     for line in renamed:
         note(line)

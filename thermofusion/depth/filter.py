@@ -5,6 +5,7 @@ Pure NumPy and OpenCV, no Open3D, no files. Tracking and fusion both look at dep
 
 from __future__ import annotations
 
+import copy
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -23,6 +24,7 @@ MIN_NEIGHBOURS = 3  # of 8: what the corner of a surface still has, and a one-pi
 CELL_PX = 4  # slopes are taken between means over squares of this size: single pixels carry only noise
 MIN_CELL_SHARE = 0.25  # of a cell's pixels that must hold depth
 READERS = 2  # threads that decode frames ahead
+KEPT_BYTES = 256 << 20  # of images that are not decoded twice
 
 
 def filter_depth(depth_m: Float32, camera: Camera, section: InputSection) -> Float32:
@@ -160,6 +162,7 @@ class DepthFrames:
     def __init__(self, scan: Scan, section: InputSection, *, keep_bytes: int = 0) -> None:
         """keep_bytes : of images that stay in memory once they were loaded, for who looks at them again."""
         self._stream, self._section = scan.depth, section
+        self._recorded_by, self._unit_m = scan.rig.depth, scan.depth_unit_m
         self._undistort = DepthUndistorter(scan.rig.depth)
         self.camera = self._undistort.camera
         self._room_bytes = keep_bytes
@@ -167,6 +170,19 @@ class DepthFrames:
 
     def __len__(self) -> int:
         return len(self._stream)
+
+    def continued_by(self, scan: Scan, section: InputSection) -> bool:
+        """Whether these are the first frames of that scan, looked at in the same way: it may have more."""
+        n, camera, own = len(self), scan.rig.depth, self._recorded_by
+        same = camera.shape == own.shape and np.array_equal(camera.K, own.K)
+        same = same and np.array_equal(camera.distortion, own.distortion) and scan.depth_unit_m == self._unit_m
+        return same and section == self._section and np.array_equal(scan.depth.index[:n], self._stream.index)
+
+    def grown(self, scan: Scan) -> DepthFrames:
+        """The frames of a scan that continues this one (`continued_by`); what was kept stays."""
+        more = copy.copy(self)
+        more._stream = scan.depth
+        return more
 
     def load(self, i: int) -> Float32:
         """Frame i: (H, W) float32 metres, NaN = none. Raises ScanError naming the file if it cannot be read."""

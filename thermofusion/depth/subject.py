@@ -6,6 +6,7 @@ while the camera walks (820 mm adrift on a whole-body scan, 4 mm without them). 
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Sequence
 
 import cv2
@@ -48,6 +49,17 @@ class SubjectFrames:
         rays = pixel_rays(self.camera)
         self._rays: Float32 = (rays / rays[..., 2:]).astype(np.float32)
         self._static = static_scene(self._frames) if subject.motion == "subject" else None
+
+    def grown(self, scan: Scan) -> SubjectFrames:
+        """The frames of a scan that continues this one; where the subject turns, the room of before."""
+        more = copy.copy(self)
+        more._frames = self._frames.grown(scan)
+        return more
+
+    @property
+    def depth(self) -> DepthFrames:
+        """All depth that is believed."""
+        return self._frames
 
     def load(self, i: int) -> tuple[Float32, Float | None]:
         """Frame i: depth (H, W) float32 m, NaN = not the subject; and the floor (4,) found in it and taken away."""

@@ -11,16 +11,18 @@ import numpy as np
 
 from ..recipe import InputSection, SubjectSection, TrackingSection
 from ..scans.formats.recorded import Growing
+from ..tracking.ahead import Ahead
 from ..tracking.frames import TrackingFrame
 from ..tracking.odometry import MAX_GAP_FRAMES
 from ..types import Float32, Scan
 from .model import Model, apparent_degC, seen_by_thermal
-from .walk import FASTEST_DEG_S, Walk
+from .walk import FASTEST_DEG_S, Placed, Walk
 
 LOOK_S = 0.1  # the file is looked at so often
 BURST_S = 0.4  # frames come in bursts: a recording is written to the disk so often
 FIRST_FRAMES = 5  # depth frames that must be there to begin
 LATE = 0.7  # of the last update's time, which the next one's guess does not fall below
+LATE_S = 3.0  # behind the walk frames are left out: the final result tracks again from there
 PAIR_S = 0.04  # a thermal frame and a depth frame this far apart show the same
 SILENT_S = 10.0  # without a new frame for so long, whoever records has died
 MISSING_S = 1.0  # what is missing is worked out so often
@@ -31,7 +33,8 @@ SHOWN_POINTS = 30_000  # of the model
 @dataclass(eq=False)
 class Live:
     """How it stands. frames : depth frames that were tracked and painted. waiting : in the file, not yet looked at.
-    intervals_s : between one update of the model and the next. points : (N, 4) float32, place m and apparent °C."""
+    skipped : not painted. intervals_s : between one update of the model and the next. points : (N, 4) float32, place m
+    and apparent °C. ahead : in the end, what the final result goes on from."""
 
     frames: int = 0
     waiting: int = 0
@@ -45,6 +48,7 @@ class Live:
     ended: bool = False
     intervals_s: list[float] = field(default_factory=list)
     points: Float32 = field(default_factory=lambda: np.empty((0, 4), np.float32))
+    ahead: Ahead | None = None
 
     @property
     def rate_hz(self) -> float:
@@ -80,7 +84,7 @@ def follow(
     """
     growing, live = Growing(path), Live()
     painter = _Painter(recipe)
-    next_frame, updated_at, new_at = 0, 0.0, time.monotonic()
+    next_frame, painted, updated_at, new_at = 0, -1, 0.0, time.monotonic()
     looked_at, took_s = 0.0, 0.0
     while not stop():
         now = time.monotonic()
@@ -96,11 +100,16 @@ def follow(
                 break
             time.sleep(0.02)
             continue
-        i = next_frame
-        if not growing.complete:  # as many frames of a burst as can be done before the next one
-            i += _step(count - next_frame, took_s) - 1
-        live.skipped += i - next_frame
+        i, step = next_frame, 1
+        if not growing.complete:  # as many frames of a burst as can be painted before the next one
+            step = _step(count - painted - 1, took_s)
+            i += step - 1 if _late(growing.scan, i) else 0
         next_frame = i + 1
+        if i - painted < step:
+            painter.track(i, live)
+            continue
+        live.skipped += i - painted - 1
+        painted = i
         begun = time.monotonic()
         painter.paint(i, live)
         done = time.monotonic()
@@ -109,9 +118,14 @@ def follow(
             live.intervals_s.append(done - updated_at)
         updated_at = done
         show(live)
-    live.ended = True
+    live.ended, live.ahead = True, painter.ahead
     show(live)
     return live
+
+
+def _late(scan: Scan | None, i: int) -> bool:
+    """Whether frame i is so old that what is shown lags behind the walk."""
+    return scan is not None and bool(scan.depth.times_s[-1] - scan.depth.times_s[i] > LATE_S)
 
 
 def _step(waiting: int, took_s: float) -> int:
@@ -141,14 +155,24 @@ class _Painter:
             self._model = Model(scan.depth_up)
             self._degC = None if scan.thermal is None else apparent_degC(scan.thermal.camera.signal)
 
-    def paint(self, i: int, live: Live) -> None:
-        """Frame i of the depth stream."""
+    def track(self, i: int, live: Live) -> Placed | None:
+        """Frame i of the depth stream, where it can be placed."""
         placed = self._walk.take(i)
         live.lost = self._walk.lost
-        if placed is None or self._model is None:
-            return
-        if placed.T_world_depth is None:
-            live.lost_frames += 1
+        if placed is None or placed.T_world_depth is not None:
+            return placed
+        live.lost_frames += 1
+        return None
+
+    @property
+    def ahead(self) -> Ahead | None:
+        """What need not be done again for the final result."""
+        return self._walk.ahead
+
+    def paint(self, i: int, live: Live) -> None:
+        """Frame i of the depth stream, into the model."""
+        placed = self.track(i, live)
+        if placed is None or placed.T_world_depth is None or self._model is None:
             return
         live.frames += 1
         live.turn_deg_s = placed.turn_deg_s

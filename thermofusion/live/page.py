@@ -11,6 +11,7 @@ from typing import Any
 from ..errors import ResourceError
 from .follow import Live
 
+POLL_S = 0.05  # the server looks so often whether it shall end
 HOME = "127.0.0.1"  # nobody else may look at a patient
 POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'"
 
@@ -25,7 +26,7 @@ class Page:
             self._server: Any = ThreadingHTTPServer((HOME, port), self._handler())
         except OSError as e:
             raise ResourceError(f"port {port} cannot be used ({e.strerror})", hint="choose another") from None
-        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+        threading.Thread(target=self._server.serve_forever, args=(POLL_S,), daemon=True).start()
 
     @property
     def address(self) -> str:

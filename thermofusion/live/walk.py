@@ -1,4 +1,7 @@
-"""Tracking while the recording grows: `tracking`'s steps, frame by frame; lost at once, found again where one was."""
+"""Tracking while the recording grows: `tracking`'s steps, frame by frame; lost at once, found again where one was.
+
+The frames go in order through the odometry that the final result begins with: it goes on from there (`ahead`).
+"""
 
 from __future__ import annotations
 
@@ -6,12 +9,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..depth.subject import SubjectFrames
+from ..depth.filter import KEPT_BYTES, DepthFrames
 from ..geometry.rigid import invert, rotation_angle_deg
 from ..recipe import InputSection, SubjectSection, TrackingSection
+from ..tracking.ahead import Ahead
 from ..tracking.frames import TrackingFrame, TrackingFrames
 from ..tracking.maps import DepthMap
-from ..tracking.odometry import RESCUE_REACHES_M, STEP_TOLERANCE, GrowingSegment
+from ..tracking.odometry import RESCUE_REACHES_M, STEP_TOLERANCE, Odometry
 from ..tracking.registration import REACH_M, agreement, find_partners, register_view
 from ..types import Float, Scan
 
@@ -40,50 +44,90 @@ class Walk:
         # what stands still is told from the whole recording: a turning subject is followed without that
         self._subject = subject.model_copy(update={"motion": "camera"}) if subject.motion == "subject" else subject
         self._frames: TrackingFrames | None = None
-        self._segment: GrowingSegment | None = None
+        self._odometry: Odometry | None = None
+        self._apart: Ahead | None = None  # what was tracked before the first frame that was left out
+        self._T_world_segment: Float | None = np.eye(4)  # of the odometry's last segment; None = it is lost
         self._keys: list[tuple[DepthMap, Float]] = []
-        self._last: tuple[float, Float] | None = None
+        self._last: tuple[TrackingFrame, Float] | None = None
         self._residual_mm, self._turn = float("nan"), 0
-        self.lost = False
+
+    @property
+    def lost(self) -> bool:
+        """Whether it is not known where the last frame is."""
+        return self._T_world_segment is None
 
     def grown(self, scan: Scan) -> None:
-        """The scan has more frames now."""
-        if self._frames is None:
-            self._frames = TrackingFrames.of(scan, input=self._input, subject=self._subject, tracking=self._tracking)
-        full = SubjectFrames(scan, input=self._input, subject=self._subject)
-        self._frames = replace(self._frames, scan=scan, subject=full, color_of=None)
+        """The scan has more frames now. Raises ScanError."""
+        if self._frames is None or not self._frames.subject.depth.continued_by(scan, self._input):
+            self._leave()  # what came before was seen by another camera, if there was something
+            depth = DepthFrames(scan, self._input, keep_bytes=KEPT_BYTES)
+            frames = TrackingFrames.of(
+                scan, input=self._input, subject=self._subject, tracking=self._tracking, depth=depth
+            )
+            self._frames = replace(frames, color_of=None)
+        self._frames = replace(self._frames, scan=scan, subject=self._frames.subject.grown(scan))
 
     def take(self, i: int) -> Placed | None:
-        """Frame i of the depth stream; None for one that shows nothing. Raises ScanError."""
+        """Frame i of the depth stream; None for one that shows nothing. Raises ScanError.
+
+        Frames that are taken in order, none left out, need not be tracked again for the final result.
+        """
         assert self._frames is not None
+        if self._apart is None and self._odometry is not None and i != self._next():
+            self._leave()
         frame = self._frames.load(i)
+        if self._odometry is None:
+            self._odometry = Odometry(
+                self._frames.intrinsics, self._tracking, timed=not self._frames.scan.times_assumed
+            )
+            if self._last is not None:  # frames were left out: on from the last one
+                self._odometry.take(self._last[0])
+                self._T_world_segment = self._last[1]
+        continued = self._odometry.take(frame)
         if frame.empty:
             return None
-        T = self._located(frame)
-        self.lost = T is None
+        T = self._located(frame, continued or self._last is None)
         turn = 0.0
         if T is not None:
-            if self._last is not None and frame.time_s > self._last[0]:
-                turn = float(rotation_angle_deg(invert(self._last[1]) @ T)) / (frame.time_s - self._last[0])
-            self._last = frame.time_s, T
+            if self._last is not None and frame.time_s > self._last[0].time_s:
+                dt_s = frame.time_s - self._last[0].time_s
+                turn = float(rotation_angle_deg(invert(self._last[1]) @ T)) / dt_s
+            self._last = frame, T
             self._keep(frame, T)
         return Placed(frame, None if T is None else self._metric(T), turn)
 
-    def _located(self, frame: TrackingFrame) -> Float | None:
-        """Pose of a frame, its zoom included."""
+    @property
+    def ahead(self) -> Ahead | None:
+        """What need not be done again for the final result; None where nothing was tracked."""
+        if self._apart is not None or self._frames is None or self._odometry is None:
+            return self._apart
+        return Ahead(self._frames, self._odometry, self._subject, self._tracking)
+
+    def _next(self) -> int:
+        """The frame that is next in order."""
         assert self._frames is not None
-        if self._segment is None:
-            self._segment = GrowingSegment(frame, self._frames.intrinsics, self._tracking)
-            return np.eye(4)
-        if not self.lost and self._segment.take(frame, timed=not self._frames.scan.times_assumed):
-            self._residual_mm = self._segment.residual_mm
-            return self._segment.pose
+        assert self._odometry is not None
+        after = self._odometry.taken[-1] + 1
+        usable = self._frames.scan.depth.usable[after:]
+        return after + int(np.argmax(usable)) if usable.any() else after
+
+    def _leave(self) -> None:
+        """Frames are left out from here on: the order ends."""
+        self._apart, self._odometry = self.ahead, None
+
+    def _located(self, frame: TrackingFrame, continued: bool) -> Float | None:
+        """Pose of the odometry's last frame in the world, its zoom included. continued : its step was believed."""
+        assert self._odometry is not None
+        if continued and self._T_world_segment is not None:
+            self._residual_mm = self._odometry.residual_mm
+            return self._T_world_segment @ self._odometry.pose
+        self._T_world_segment = None
         for key, T_world_key in self._tried():
             T, partners = register_view(
                 frame.map, [(key, np.eye(4))], np.eye(4), RESCUE_REACHES_M, tolerance=STEP_TOLERANCE
             )
             if partners is not None and self._same_place(frame, key, T):
-                self._segment = GrowingSegment(frame, self._frames.intrinsics, self._tracking, T_world_key @ T)
+                self._T_world_segment = T_world_key @ T @ invert(self._odometry.pose)
                 return T_world_key @ T
         return None
 

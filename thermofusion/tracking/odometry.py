@@ -45,21 +45,62 @@ class Segment:
     fragments: tuple[Fragment, ...]
 
 
+class Odometry:
+    """Frames one after the other, as far as they came: what `track` begins with, or goes on from.
+
+    taken : positions in the depth stream of all frames so far, empty ones too.
+    """
+
+    def __init__(self, intrinsics: Intrinsics, tracking: TrackingSection, *, timed: bool = True) -> None:
+        """intrinsics : of the frames. timed : their times were recorded, so their speed counts."""
+        self.taken: list[int] = []
+        self._intrinsics, self._tracking, self._timed = intrinsics, tracking, timed
+        self._segments: list[GrowingSegment] = []
+
+    def take(self, frame: TrackingFrame) -> bool:
+        """The next frame; False where its step fails its test, or it is the first: it begins a new segment.
+
+        Empty frames are left out, and break nothing.
+        """
+        self.taken.append(frame.index)
+        if frame.empty or (self._segments and self._segments[-1].take(frame, timed=self._timed)):
+            return True
+        self._segments.append(GrowingSegment(frame, self._intrinsics, self._tracking))
+        return False
+
+    @property
+    def pose(self) -> Float:
+        """(4, 4) of the last frame that shows something, in its segment's frame, m."""
+        return self._segments[-1].pose
+
+    @property
+    def residual_mm(self) -> float:
+        """Of the last segment, as `GrowingSegment.residual_mm`."""
+        return self._segments[-1].residual_mm
+
+    def finished(self) -> list[Segment]:
+        """All segments; no frame may follow."""
+        return [s.finished() for s in self._segments]
+
+
 def odometry(
-    frames: TrackingFrames, indices: NDArray[np.intp], tracking: TrackingSection, progress: Progress
+    frames: TrackingFrames,
+    indices: NDArray[np.intp],
+    tracking: TrackingSection,
+    progress: Progress,
+    begun: Odometry | None = None,
 ) -> list[Segment]:
     """Tracks frames (N,), positions in the depth stream, in order; a step that fails its test begins a new segment.
 
-    Empty frames are left out.
+    Empty frames are left out. begun : has taken the first of these frames already; it is used up.
     """
-    segments: list[GrowingSegment] = []
-    for n, frame in enumerate(frames.read_ahead(indices)):
+    if begun is None:
+        begun = Odometry(frames.intrinsics, tracking, timed=not frames.scan.times_assumed)
+    first = len(begun.taken)
+    for n, frame in enumerate(frames.read_ahead(indices[first:]), first):
         progress("track", n, len(indices))
-        if frame.empty:
-            continue
-        if not (segments and segments[-1].take(frame, timed=not frames.scan.times_assumed)):
-            segments.append(GrowingSegment(frame, frames.intrinsics, tracking))
-    return [s.finished() for s in segments]
+        begun.take(frame)
+    return begun.finished()
 
 
 class GrowingSegment:

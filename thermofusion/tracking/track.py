@@ -22,6 +22,7 @@ from ..geometry.rigid import interpolate_trajectory, invert, se3_exp, se3_log
 from ..progress import Progress, silent
 from ..recipe import InputSection, SubjectSection, TrackingSection
 from ..types import Bool, Float, Scan, Trajectory, brief
+from .ahead import Ahead
 from .fragments import Fragment
 from .frames import TrackingFrames
 from .joint import LOOP_APART, overlapping, solve_jointly
@@ -81,11 +82,13 @@ def locate(
     subject: SubjectSection,
     tracking: TrackingSection,
     depth: DepthFrames | None = None,
+    ahead: Ahead | None = None,
     progress: Progress = silent,
 ) -> TrackingResult:
     """Where the depth camera was: the recorded trajectory, or it refined, or estimated from the depth alone.
 
-    depth : the scan's frames, if they are at hand. A recorded trajectory is held against the depth first
+    depth : the scan's frames, if they are at hand. ahead : what was tracked while it was recorded; used up.
+    A recorded trajectory is held against the depth first
     (`recorded.believed`); QualityError where it cannot be right.
     Raises ScanError if a recorded trajectory is asked for and there is none, or no frame shows the subject.
     """
@@ -93,7 +96,7 @@ def locate(
         raise ScanError("no trajectory was recorded", place=scan.root, hint="set tracking.source to auto or estimate")
     if scan.trajectory is None or tracking.source == "estimate":
         scan = replace(scan, trajectory=None)
-        return track(scan, input=input, subject=subject, tracking=tracking, depth=depth, progress=progress)
+        return track(scan, input=input, subject=subject, tracking=tracking, depth=depth, ahead=ahead, progress=progress)
     trajectory, messages = believed(scan)
     scan = replace(scan, trajectory=trajectory)
     if not tracking.refine:
@@ -118,11 +121,13 @@ def track(
     subject: SubjectSection,
     tracking: TrackingSection,
     depth: DepthFrames | None = None,
+    ahead: Ahead | None = None,
     progress: Progress = silent,
 ) -> TrackingResult:
     """Track the depth camera through a scan; a recorded trajectory, if there is one, is the start.
 
-    depth : the scan's frames, if they are at hand. Raises ScanError if no frame shows the subject.
+    depth : the scan's frames, if they are at hand. ahead : what was tracked while it was recorded; used up.
+    Raises ScanError if no frame shows the subject.
     """
     frames = TrackingFrames.of(scan, input=input, subject=subject, tracking=tracking, depth=depth)
     indices = np.flatnonzero(scan.depth.usable)
@@ -130,7 +135,8 @@ def track(
         T, valid = interpolate_trajectory(scan.trajectory, scan.depth.times_s, max_gap_s=input.max_pose_gap_ms / 1e3)
         segments = _along(T, frames, indices[valid[indices]], tracking)
     else:
-        segments = odometry(frames, indices, tracking, progress)
+        begun = None if ahead is None else ahead.begun(frames, indices, subject, tracking)
+        segments = odometry(frames, indices, tracking, progress, begun)
     if not segments:
         raise ScanError(
             "no depth frame shows a subject within input.min_depth_m and input.max_depth_m",
