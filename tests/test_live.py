@@ -6,6 +6,7 @@ import json
 import time
 import urllib.error
 import urllib.request
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -23,7 +24,9 @@ from thermofusion.recording.record import Beside, Until, record
 from thermofusion.recording.replay import open_replay, playing
 from thermofusion.scans import open_scan
 from thermofusion.scans.formats.recorded import Growing
+from thermofusion.tracking.frames import PROBES, TrackingFrames
 from thermofusion.tracking.odometry import MAX_GAP_FRAMES
+from thermofusion.tracking.track import locate
 
 
 @pytest.fixture(scope="module")
@@ -165,3 +168,54 @@ def test_a_burst_is_shown_as_far_as_there_is_time():
     assert _step(6, 0.15) == 3  # two can be done
     assert _step(6, 2.0) == MAX_GAP_FRAMES  # no farther than tracking can jump
     assert _step(1, 2.0) == 1
+
+
+def located(recording, recipe, ahead=None):
+    scan = open_scan(recording)
+    return locate(scan, input=recipe.input, subject=recipe.subject, tracking=recipe.tracking, ahead=ahead)
+
+
+@pytest.mark.parametrize("left_out", [(), (40, 41)])
+def test_the_final_poses_go_on_from_what_was_followed_and_are_the_same(taken, recipe, left_out, monkeypatch):
+    walk, scan = Walk(recipe.input, recipe.subject, recipe.tracking), open_scan(taken)
+    for count in (20, 60, len(scan.depth)):  # it grows
+        walk.grown(first_frames(scan, count))
+        for i in range({20: 0, 60: 20}.get(count, 60), count):
+            if i not in left_out:
+                walk.take(i)
+    taken_first = len(walk.ahead.odometry.taken)
+    assert taken_first == (40 if left_out else 90)  # a gap ends the order
+    tracked_again = []
+    load = TrackingFrames.load
+    monkeypatch.setattr(TrackingFrames, "load", lambda own, i: tracked_again.append(i) or load(own, i))
+    one = located(taken, recipe, walk.ahead)
+    assert tracked_again[PROBES:] == list(range(taken_first, 90))
+    other = located(taken, recipe)
+    np.testing.assert_array_equal(one.trajectory.T_world_depth, other.trajectory.T_world_depth)
+    np.testing.assert_array_equal(one.residual_mm, other.residual_mm)
+    assert (one.loop_closures, one.converged, one.messages) == (other.loop_closures, other.converged, other.messages)
+
+
+def test_what_was_followed_otherwise_is_not_gone_on_from(taken, recipe):
+    walk, scan = Walk(recipe.input, recipe.subject, recipe.tracking), open_scan(taken)
+    walk.grown(scan)
+    for i in range(10):
+        walk.take(i)
+    ahead, indices = walk.ahead, np.arange(90)
+    sections = {"subject": recipe.subject, "tracking": recipe.tracking}
+    frames = TrackingFrames.of(scan, input=recipe.input, **sections)
+    assert ahead.begun(frames, indices, **sections) is ahead.odometry
+    assert ahead.begun(replace(frames, zoom=1.5), indices, **sections) is None  # the whole tells that it was near
+    assert ahead.begun(frames, indices[1:], **sections) is None
+    stricter = recipe.tracking.model_copy(update={"min_fitness": 0.9})
+    assert ahead.begun(frames, indices, recipe.subject, stricter) is None
+    assert ahead.depth_frames(scan, recipe.input) is not None
+    assert ahead.depth_frames(scan, recipe.input.model_copy(update={"max_depth_m": 1.0})) is None
+    assert ahead.depth_frames(replace(scan, depth_unit_m=0.002), recipe.input) is None
+
+
+def first_frames(scan, count):
+    """A scan of which so many depth frames are there."""
+    s = scan.depth
+    cut = replace(s, times_s=s.times_s[:count], places=s.places[:count], index=s.index[:count], usable=s.usable[:count])
+    return replace(scan, depth=cut)

@@ -29,7 +29,9 @@ TICKS = os.sysconf("SC_CLK_TCK")
 def started(tree: Path, *args: object) -> subprocess.Popen[bytes]:
     """The command of a version."""
     command = [sys.executable, "-m", "thermofusion", *map(str, args)]
-    return subprocess.Popen(command, env=os.environ | {"PYTHONPATH": str(tree)}, stderr=subprocess.DEVNULL)
+    return subprocess.Popen(
+        command, env=os.environ | {"PYTHONPATH": str(tree), "PYTHONSAFEPATH": "1"}, stderr=subprocess.DEVNULL
+    )
 
 
 def cpu_s(pid: int) -> float:
