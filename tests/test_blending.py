@@ -14,7 +14,7 @@ from thermofusion.physics.equation import apparent_radiance, paper_chain
 from thermofusion.recipe import TemperatureSection
 from thermofusion.temperature import blend as blending
 from thermofusion.temperature import crosscal
-from thermofusion.temperature.blend import _around, blend
+from thermofusion.temperature.blend import around, blend
 from thermofusion.temperature.problem import remove_air_path
 from thermofusion.temperature.room.stated import Room
 from thermofusion.temperature.uncertainty import (
@@ -290,14 +290,14 @@ def test_scatter_around_a_place_has_no_steps():
     """What rows around say blends from place to place; a flat value stays flat, and unmeasured ones take no part."""
     rng = np.random.default_rng(4)
     points = rng.uniform(0, 0.3, (4000, 3)).astype(np.float32)
-    flat = _around(np.full(4000, 2.0), points, 0.05)
+    flat = around(np.full(4000, 2.0), points, 0.05)
     np.testing.assert_allclose(flat, 2.0, rtol=1e-6)
     values = np.where(points[:, 0] < 0.15, 1.0, 3.0)
     values[::7] = np.nan
-    out = _around(values, points, 0.05)
+    out = around(values, points, 0.05)
     order = np.argsort(points[:, 0])
     line = np.stack([np.linspace(0.01, 0.29, 400), np.full(400, 0.15), np.full(400, 0.15)], axis=1)
-    along = _around(np.append(values, np.full(400, np.nan)), np.concatenate([points, line]), 0.05)[4000:]
+    along = around(np.append(values, np.full(400, np.nan)), np.concatenate([points, line]), 0.05)[4000:]
     assert np.isfinite(out[order]).all()
     assert np.abs(np.diff(along)).max() < 0.1
     assert along[0] == pytest.approx(1.0)

@@ -36,8 +36,8 @@ STAGES = (
     Stage("tracking", ("input", "subject", "tracking")),
     Stage("surface", ("input", "subject", "surface"), edition=5),
     Stage("rig", ("input", "rig"), edition=4),
-    Stage("mapping", ("input", "mapping"), edition=11),
-    Stage("temperature", ("mapping", "temperature"), edition=11, handed_out=RESULT),
+    Stage("mapping", ("input", "mapping"), edition=12),
+    Stage("temperature", ("mapping", "temperature"), edition=12, handed_out=RESULT),
 )
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
 KEPT_THERMAL_BYTES = 64 << 20  # of images that are not decoded twice

@@ -47,6 +47,7 @@ from .references import BlackbodyReading, read_blackbodies
 from .scatter import check_scatter, estimate_scatter, spread_on
 from .span import placed
 from .views import thermal_views
+from .witness import Depths, DepthWitness
 
 EDGE_CAP_PX = 32.0  # distances to a silhouette are stored up to here; nothing depends on larger ones
 NORMAL_OFFSET_M = 0.003  # a ray to the eye starts this far off the surface, so that noise does not shadow itself
@@ -186,7 +187,11 @@ def observe(
         scatter = check_scatter(background, lens, converter.band, stated)
     if scatter.share:
         converter, background = SignalConverter(stream.camera, bad, scatter), background.without(scatter)
-    observations = observe_views(stream, SurfaceRays(surface, body), views, converter, mapping, progress=progress)
+    witness = None
+    if rig.free is None:
+        witness = DepthWitness(scan, trajectory, views, stream.camera.lens, mapping.visibility_tolerance_mm / 1e3)
+    rays = SurfaceRays(surface, body)
+    observations = observe_views(stream, rays, views, converter, mapping, witness=witness, progress=progress)
     blackbodies = read_blackbodies(stream, views, scan.references, converter)
     uv = np.argwhere(bad)[:, ::-1].astype(np.int32)
     spread = spread_on(stream, views, converter, observations, len(surface))
@@ -202,15 +207,21 @@ def observe_views(
     converter: SignalConverter,
     mapping: MappingSection,
     *,
+    witness: DepthWitness | None = None,
     progress: Progress = silent,
 ) -> Observations:
-    """All observations of the surface's vertices by the thermal views. Raises ScanError if no view sees the surface."""
+    """All observations of the surface's vertices by the thermal views. Raises ScanError if no view sees the surface.
+
+    witness : depth frames that tell what else stood in the way.
+    """
 
     def one(view: int) -> Observations:
         frame = int(views.frame[view])
         image = converter.radiance(stream.load(frame), stream.places[frame])
         posed = surface.at(float(views.times_s[view]))
-        return observe_view(posed, stream.camera.lens, views.T_world_thermal[view], image, mapping, view=view)
+        depths = None if witness is None else witness.of(view)
+        T = views.T_world_thermal[view]
+        return observe_view(posed, stream.camera.lens, T, image, mapping, view=view, depths=depths)
 
     parts: list[Observations] = []
     with ThreadPoolExecutor(max_workers=3) as pool:
@@ -234,10 +245,12 @@ def observe_view(
     mapping: MappingSection,
     *,
     view: int = 0,
+    depths: Depths | None = None,
 ) -> Observations:
     """The observations of one thermal image, sorted by vertex.
 
-    radiance : (H, W) float32. Columns as in `Observations`; footprint = range²/(f² cosθ) [m²].
+    radiance : (H, W) float32. Columns as in `Observations`; footprint = range²/(f² cosθ) [m²]. depths : what the depth
+    frame of the moment shows: rows that it hides are dropped, doubtful ones count as near to an outline.
     """
     mesh, eye_m = surface.mesh, T_world_thermal[:3, 3]
     cos = viewing_cosine(mesh.vertices_m, mesh.normals, eye_m)
@@ -253,11 +266,19 @@ def observe_view(
     edge_px = _edge_distance(surface, camera, T_world_thermal, cos, tolerance_m)
     pixel = np.rint(uv).astype(np.intp)
     distance = edge_px.ravel().take(pixel[:, 1] * camera.width_px + pixel[:, 0])
-    clear = np.flatnonzero(distance >= min(mapping.last_resort_silhouette_px, mapping.silhouette_px))
+    least_px = min(mapping.last_resort_silhouette_px, mapping.silhouette_px)
+    clear = np.flatnonzero(distance >= least_px)
     candidates, points, uv = candidates.take(clear), points.take(clear, axis=0), uv.take(clear, axis=0)
 
     signal = sample_bilinear(radiance, uv)
-    seen = np.flatnonzero(surface.visible(candidates, eye_m, tolerance_m) & np.isfinite(signal))
+    distance = distance.take(clear)
+    hidden = np.zeros(len(candidates), bool)
+    if depths is not None:
+        hidden, doubtful = depths.judge(uv, points[:, 2], cos.take(candidates))
+        distance[doubtful] = least_px
+        if least_px == mapping.silhouette_px:  # there is no last resort
+            hidden |= doubtful
+    seen = np.flatnonzero(surface.visible(candidates, eye_m, tolerance_m) & np.isfinite(signal) & ~hidden)
     points, uv = points.take(seen, axis=0), uv.take(seen, axis=0)
     vertex, range_m = candidates.take(seen), np.sqrt(np.einsum("ij,ij->i", points, points))
     cos_angle = cos.take(vertex)
@@ -270,7 +291,7 @@ def observe_view(
         footprint_m2=(range_m**2 / (camera.focal_px**2 * cos_angle)).astype(np.float32),
         u_px=uv[:, 0].astype(np.float32),
         v_px=uv[:, 1].astype(np.float32),
-        edge_px=distance.take(clear).take(seen),
+        edge_px=distance.take(seen),
     )
 
 

@@ -13,6 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from ..physics.band import ZERO_DEGC_K, Band
 from ..physics.emissivity import EmissivityModel, follows_shape
@@ -39,6 +40,8 @@ from .uncertainty import (
 THREADS = 2
 BLOCK = 1_500_000  # rows worked on at once by each thread: bounds memory whatever the scan
 BLOCK_VIEWS = 5  # following each other: what they err in common is one error
+FEWEST_BLOCKS = 10  # of a scan's views: with few of them each stands for itself
+DISAGREE = 0.01  # chance below which a vertex's own views disagree by more than their errors explain
 PATCH_M = 0.05  # of skin, over which vertices' own scatter is averaged: one vertex has too few views for it
 MAX_CELLS = 200  # of the grid along its longest side
 OTHER_EPSILON_SIGMA = 0.1  # of the emissivity of what is not skin: cloth and hair reach from 0.75 to 0.98
@@ -201,10 +204,15 @@ def _blend(rows: Observations, groups: Groups, problem: ThermalProblem, task: _T
         L0, L_s = surface_radiance(x, 1.0, L_r), surface_radiance(x, task.epsilon0, L_r)
         columns["residual"], spread = mean.scatter(solved)
         columns["spread_K"] = spread / task.slope_L
-        columns["own_K2"] = mean.own_variance(solved, rows.view // BLOCK_VIEWS) / (task.slope_L * task.epsilon0) ** 2
+        size = int(np.clip(problem.n_views // FEWEST_BLOCKS, 1, BLOCK_VIEWS))
+        to_K2 = (task.slope_L * task.epsilon0) ** -2
+        columns["own_K2"] = mean.own_variance(solved, rows.view // size) * to_K2
+        apart_K2 = mean.own_variance(solved, np.arange(len(rows), dtype=np.int32)) * to_K2
         if task.with_uncertainty:
             levers = _levers(rows, mean, solved, task, errors, problem.room_errors(groups.vertex))
             parts, common, modes = _errors_of(levers, x, band.temperature_K(L_s), columns, task, errors)
+            if method == "joint":
+                parts["views"] = _disagreement(apart_K2, parts, groups.count.astype(np.int32))
             for name, effect in problem.effects.items():
                 common[name] = effect[groups.vertex] / (task.slope_L * task.epsilon0)
     columns |= {"absolute_K": band.temperature_K(L_s), "normal_equivalent_K": band.temperature_K(L0)}
@@ -235,6 +243,18 @@ def _errors_of(
     views_K = None if calibration else columns["spread_K"]
     path_m = columns["distance_m"] - task.distance_m
     return vertex_uncertainty(budget, levers, x, T_K, path_m, columns["radius_m"], views_K)
+
+
+def _disagreement(apart_K2: Float, parts_K: dict[str, NDArray], count: Int) -> Float:
+    """(G,) K, what a vertex's mean errs by as the scatter of its own rows says, beyond what the budget explains.
+
+    apart_K2 : variance of the mean by that scatter, NaN for one row. parts_K : of the budget. count : rows. Only where
+    chance would show as much once in a hundred vertices: few rows know their own scatter badly.
+    """
+    budget_K2 = np.sum([p**2 for p in parts_K.values()], axis=0)
+    freedom = np.maximum(count - 1, 1)
+    beyond = np.nan_to_num(apart_K2) * freedom > chdtri(freedom, DISAGREE) * budget_K2
+    return np.where(beyond, np.sqrt(np.maximum(np.nan_to_num(apart_K2) - budget_K2, 0)), 0.0)
 
 
 def _assembled(blocks: list[_Block], oblique: Bool, problem: ThermalProblem, task: _Task) -> BlendResult:
@@ -294,11 +314,11 @@ def _gain_pivot_K(problem: ThermalProblem, calibration: Calibration | None) -> f
 
 def _own_noise(noise_K: Float32, normals_K: Float32, own_K2: Float32, points_m: Float32) -> Float32:
     """Noise (V,) K at points_m (V, 3), or what rows around say, own_K2 (V,) K², beyond normals_K (V,) K."""
-    around_K2 = np.nan_to_num(_around(own_K2, points_m, PATCH_M))  # where no row has others to be compared with: 0
+    around_K2 = np.nan_to_num(around(own_K2, points_m, PATCH_M))  # where no row has others to be compared with: 0
     return np.sqrt(np.maximum(noise_K**2, around_K2 - normals_K**2)).astype(np.float32)
 
 
-def _around(values: NDArray, points_m: NDArray, size_m: float) -> Float:
+def around(values: NDArray, points_m: NDArray, size_m: float) -> Float:
     """Mean of values (V,) about each of points_m (V, 3), over cells of size_m that blend into each other; NaN = none.
 
     Values are shared out to the eight nodes of a grid around a point, and read from there again.

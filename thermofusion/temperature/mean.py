@@ -15,6 +15,9 @@ from ..types import Float, Float32, Int
 L1_STEPS, TUKEY_STEPS = 4, 3
 SCALE_ROWS = 200_000  # enough for a robust scale
 L1_FLOOR = 0.3  # of one sigma: below it the L1 start is quadratic
+KEPT = 0.25  # of its weight: what a row must keep to count among those that agree
+FEW = 3  # rows: of more than these, a median tells what most of them say
+FAR_BETTER = 0.75  # share of a vertex's weight: a row with as much is believed against the others
 LEAST_WEIGHT = 0.02  # share of a vertex's weight that must survive Tukey's
 
 
@@ -88,7 +91,7 @@ class RobustMean:
     statistical: bool
 
     def solve(self, *, robust: bool, scale: float | None = None) -> Solved:
-        """x of all groups. Robust: weights of an L1 fit, then Tukey's.
+        """x of all groups. Robust: weights of an L1 fit, then Tukey's; of few rows that disagree, see `_balanced`.
 
         scale : of residuals over the rows' own σ; None = taken from the residuals.
         """
@@ -105,7 +108,8 @@ class RobustMean:
             weight = self._weights(x, root, TUKEY * (scale or self._scale(x, root, sample)), tukey_weight)
             weight = self._measured_kept(weight, l1)
             x = self._estimate(weight)
-        return Solved(x, weight)
+        weight = self._balanced(weight)
+        return Solved(self._estimate(weight), weight)
 
     def residual(self, x: Float) -> Float32:
         """y - E·x of all rows (N,), W m-2 sr-1, of the groups' x (G,)."""
@@ -120,7 +124,7 @@ class RobustMean:
         squares, n = self.residual(solved.x) ** 2, self.groups.count
         freedom = np.where(n > 1, n - 1, np.nan)
         sigmas = np.sqrt(self.groups.sums(self.weight * squares) / freedom)
-        spread = self.groups.sums(solved.weight * squares) / self.groups.sums(solved.weight)
+        spread = self.groups.sums(self.weight * squares) / self.groups.sums(self.weight)
         return sigmas, np.sqrt(spread * n / freedom)
 
     def own_variance(self, solved: Solved, block: Int) -> Float:
@@ -155,6 +159,30 @@ class RobustMean:
         """The weights; vertices on which all rows contradict each other keep those of the L1 fit."""
         lost = self.groups.sums(weight) < LEAST_WEIGHT * self.groups.sums(self.weight)
         return np.where(self.groups.rows(lost), l1, weight) if lost.any() else weight
+
+    def _balanced(self, weight: Float32) -> Float32:
+        """The weights; of groups of few rows no two of which agree, those of a random-effects mean.
+
+        Views that contradict each other do not say which is right: all err by what they differ, τ², so that they count
+        nearly alike, 1/(σ² + τ²); τ² is DerSimonian and Laird's (1986). A view known to be far better is followed.
+        """
+        if not self.statistical:
+            return weight
+        kept = self.groups.sums(weight > KEPT * self.weight)
+        best = np.maximum.reduceat(self.weight, self.groups.start) if len(self.groups) else np.zeros(0)
+        lost = (
+            (kept <= 1)
+            & (self.groups.count > 1)
+            & (self.groups.count <= FEW)
+            & (best < FAR_BETTER * self.groups.sums(self.weight))
+        )
+        if not lost.any():
+            return weight
+        residual, w, at = self.residual(self._estimate(self.weight)), self.weight.astype(np.float64), self.groups.rows
+        total, squares = self.groups.sums(w * self.E**2), self.groups.sums((w * self.E**2) ** 2)
+        Q, freedom = self.groups.sums(w * residual.astype(np.float64) ** 2), self.groups.count - 1
+        tau2 = np.maximum(Q - freedom, 0) / np.maximum(total - squares / total, 1e-300)
+        return np.where(at(lost), 1 / (1 / w + at(np.where(lost, tau2, 0.0))), weight).astype(np.float32)
 
     def _scale_rows(self) -> tuple[NDArray, Float]:
         """Rows that the robust scale is taken from, and what makes up for their vertex's own freedom.

@@ -32,11 +32,13 @@ from ..types import (
 from .blend import BlendResult, blend
 from .crosscal import Calibration, Overlap
 from .inputs import inputs_of
+from .passed_over import contradicted, doubtful_with_neighbours
 from .problem import ThermalProblem
 from .room.map import RoomMap
 from .room.stated import Room
 from .room.survey import survey
 from .room.witness import sides_of
+from .sensor.shown import table
 from .skin import not_skin
 
 Sections = tuple[MappingSection, TemperatureSection]
@@ -44,6 +46,11 @@ METHODS = ("nearest-view", "mean", "cos-resolution", "paper", "corrected-cos", "
 CAVITY_FRACTION = 0.2  # of the hemisphere: beyond it reflection between body parts exceeds 0.1 K
 CAVITY_K = 0.05  # that reflection adds at least: things as warm as the room add nothing
 HIGH_RESIDUAL = 3.0  # views disagree by more than this many of their own sigmas: hair, clothes, motion
+AGREE_K, APART_K = (
+    0.2,
+    0.6,
+)  # rms of views about a vertex: below the first nobody minds, beyond the second nothing excuses
+PASSED_OVER_K = 0.85  # two views so far apart have an rms of `APART_K`
 ANGLE_ROWS, ANGLE_STEP_DEG, ANGLE_LEAST = 200_000, 5.0, 200  # of the plot over the angle: rows, bins, rows of a bin
 UNCERTAINTY_MEANS = "one sigma about the level common to all vertices; _absolute, where the level is known: with it"
 
@@ -122,8 +129,14 @@ def solve(
     result = blend(problem, calibration)
     progress("temperature", 4, 4)
     body_fraction = None if problem.around is None else problem.around.body_fraction
+    shown = _flagged(_mesh(mesh, result, calibration, _cavity(problem), problem.room, other), mapped.unsettled)
+    if calibration is not None:
+        against = contradicted(problem, mapped.observations, calibration, result, PASSED_OVER_K)
+        against |= (shown.flags & VertexFlag.HIGH_RESIDUAL) > 0
+        against |= doubtful_with_neighbours(against, result.count, problem.points_m)
+        shown = replace(shown, flags=shown.flags | np.where(against, VertexFlag.HIGH_RESIDUAL, 0).astype(np.uint8))
     return Temperature(
-        mesh=_flagged(_mesh(mesh, result, calibration, _cavity(problem), problem.room, other), mapped.unsettled),
+        mesh=shown,
         absolute_degC=_degC(result.absolute_K),
         normal_equivalent_degC=_degC(result.normal_equivalent_K),
         apparent_degC=_degC(result.apparent_K),
@@ -214,7 +227,9 @@ def _mesh(
     flags[other] |= np.uint8(VertexFlag.NOT_SKIN)
     flags[result.count == 1] |= np.uint8(VertexFlag.SINGLE_VIEW)
     flags[result.oblique] |= np.uint8(VertexFlag.OBLIQUE)
-    flags[np.nan_to_num(result.residual) > HIGH_RESIDUAL] |= np.uint8(VertexFlag.HIGH_RESIDUAL)
+    spread_K = np.nan_to_num(result.spread_K)
+    apart = (np.nan_to_num(result.residual) > HIGH_RESIDUAL) & (spread_K > AGREE_K) | (spread_K > APART_K)
+    flags[apart] |= np.uint8(VertexFlag.HIGH_RESIDUAL)
     flags[cavity] |= np.uint8(VertexFlag.CAVITY)
     anchored = calibration is not None and calibration.anchored
     parts = dict(result.uncertainty.parts_K)
@@ -253,6 +268,7 @@ def _crosscal_report(c: Calibration, mapped: Mapped, problem: ThermalProblem, re
         "offsets_K": c.offsets_K,
         "view_frames": mapped.views.frame,
         "view_rms_K": c.view_rms_K,
+        "field": table(c.field, c.sensor, c.slope_L),
         "field_rms_K": float(np.sqrt((c.field.coefficients**2).sum()) / c.slope_L),
         "shape": c.shape,
         "shape_sigma": c.shape_sigma,

@@ -167,8 +167,8 @@ class Uncertainty:
         normals : of the surface. registration : thermal image on a temperature gradient. silhouette : room mixed in at
         the body's outline. air : differences in the air path. emissivity0, reflected : what errors of ε(0) and T_refl
         do beyond their common shift. gain : likewise. scale : of the depth, on a gradient. pattern : what
-        residuals still have in common by place in the image. views : how far views disagree, for methods that do
-        not calibrate them.
+        residuals still have in common by place in the image. views : how far views disagree beyond what the other
+        parts explain; for methods that do not calibrate them, all of it.
         path : of air between subject and camera, more or less than the reference's. operator : who holds the camera.
         scatter : of the lens's scatter that was taken off, or could be there.
         not_skin : emissivity of what is flagged as not skin.
