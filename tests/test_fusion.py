@@ -27,7 +27,7 @@ from thermofusion.recipe import load_recipe
 from thermofusion.surface import surface as fusion
 from thermofusion.surface.clean import subject_only
 from thermofusion.surface.surface import SurfaceResult, depth_poses, fuse_surface
-from thermofusion.surface.tsdf import Frames, depth_noise, integrate_frames, plan_grid, survey_depth
+from thermofusion.surface.tsdf import Frames, VoxelGrid, depth_noise, integrate_frames, plan_grid, survey_depth
 from thermofusion.types import Camera, Rig, Scan, Stream, Trajectory
 
 CAMERA = Camera(240, 180, np.array([[230.0, 0, 121.3], [0, 233.0, 88.2], [0, 0, 1]]))
@@ -453,3 +453,23 @@ def test_a_floor_smeared_into_layers_goes_where_tracking_saw_it() -> None:
     all_of_it = subject.model_copy(update={"background": "keep"})
     kept = subject_only(*soup, survey, None, subject=all_of_it, floor_plane=np.array([0, 0, 1.0, -0.3]))
     assert (np.abs(kept.vertices_m[:, 2]) < 0.06).any()  # much lies below what was given: it was no floor
+
+
+def test_a_look_past_the_subject_empties_what_is_nearer_and_ends_in_no_surface() -> None:
+    """Depth below 0: what was closed by mistake opens again where later frames look through."""
+    near = np.full(CAMERA.shape, 1.0, np.float32)
+    past = near.copy()
+    past[:, 120:126] = -1.6  # a gap between fingers
+    images, poses = [near] * 2 + [past] * 6, np.tile(np.eye(4), (8, 1, 1))
+    scan, recipe = scan_of([near] * 8), load_recipe(RECIPE)
+    frames = DepthFrames(scan, recipe.input)
+    placed = depth_poses(scan, Trajectory(scan.depth.times_s, poses), 0.1)
+    survey = survey_depth(scan, frames, placed)
+    grid = VoxelGrid(survey, plan_grid(scan, survey, input=recipe.input, surface=recipe.surface), 4000)
+    assert all(grid.integrate(image, T) for image, T in zip(images, poses, strict=True))
+    vertices, _ = grid.extract(1)
+    left, right = ((u - CAMERA.K[0, 2]) / CAMERA.K[0, 0] for u in (119.5, 125.5))
+    x = vertices[:, 0]
+    assert not ((x > left + 5e-3) & (x < right - 5e-3) & (np.abs(vertices[:, 2] - 1.0) < 5e-3)).any()
+    assert vertices[:, 2].max() < 1.1
+    np.testing.assert_allclose(vertices[(x < left - 0.02) | (x > right + 0.02), 2], 1.0, atol=2e-3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import pairwise
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -15,6 +16,7 @@ from thermofusion.geometry.camera import pixel_rays
 from thermofusion.geometry.outline import OutlineCaster, project_contour
 from thermofusion.geometry.rigid import invert, se3_exp, transform_points
 from thermofusion.motion.body import moved_by
+from thermofusion.motion.coarse import clear_of_edges
 from thermofusion.motion.estimate import STILL, estimate, look_points
 from thermofusion.motion.field import MotionField, affine, displacement, rotations
 from thermofusion.motion.gauge import common_motion, poses_without, without
@@ -233,3 +235,32 @@ def test_an_outline_is_carried_along_to_where_the_moved_body_shows_it(body):
             off[name] = np.percentile(np.abs(across[distance < 5]), 95)
         assert off["carried"] < 0.2
         assert off["left"] > 3 * off["carried"]
+
+
+def test_what_stands_behind_an_edge_is_not_looked_up():
+    """A near square before a slanted wall: pixels on either side of its rim go, those of the slope and inside stay."""
+    u = np.arange(50)[None] * np.ones((40, 1))
+    z = (1.5 + 0.01 * u).astype(np.float32)
+    z[10:30, 15:35] = 1.3
+    left = clear_of_edges(z, 300.0)
+    rim = np.zeros(z.shape, bool)
+    rim[9:31, 14:36] = True
+    rim[11:29, 16:34] = False
+    np.testing.assert_array_equal(np.isnan(left), rim)
+    np.testing.assert_array_equal(left[~rim], z[~rim])
+
+
+def test_a_look_past_the_body_is_minus_what_stands_behind(body):
+    """So that the fusion knows where a finger ends; nothing of it comes to rest."""
+    camera = Camera(320, 240, np.array([[280.0, 0, 159.5], [0, 280, 119.5], [0, 0, 1]]))
+    graph = build_graph(body.vertices_m, body.triangles, 0.15)
+    T = walk(12.0, tremor=0.0).T_world_depth[10]
+    zero = MotionField.at_rest(graph.at_m, np.array([0.0, 1.0]))
+    alone = depth_of(body, camera, T)
+    seen = np.where(np.isfinite(alone), alone, np.float32(2.5))
+    rest = Warp(RestSurface(body.vertices_m, body.triangles, graph.binding, zero), camera)(seen, T, 0.5)
+    past = rest < 0
+    np.testing.assert_allclose(rest[past], -2.5)
+    assert not np.isfinite(alone[past]).any()
+    near = cv2.dilate(np.isfinite(alone).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    assert past[near & ~np.isfinite(alone)].mean() > 0.99

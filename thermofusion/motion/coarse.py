@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Protocol
 
+import cv2
 import numpy as np
 
 from ..types import Camera, Float, Float32
@@ -12,6 +13,7 @@ from .rows import CoarseFrames
 
 WIDTH_PX = 320  # of a remembered image, about
 MAX_BYTES = 400 << 20  # of all: more frames than fit are thinned out
+EDGE_M, EDGE_PX = 0.03, 4.0  # of depth between neighbours: no slope that is looked at makes such a step
 
 
 class Frames(Protocol):
@@ -56,4 +58,18 @@ class Remembering:
         first = s // 2
         intrinsics = (K[0, 0] / s, K[1, 1] / s, (K[0, 2] - first) / s, (K[1, 2] - first) / s)
         T = np.array([T_of_frame[i] for i in kept]).reshape(-1, 4, 4)
-        return CoarseFrames([self._images[self._kept[i]] for i in kept], intrinsics, times_s[kept], T)
+        images = [clear_of_edges(self._images[self._kept[i]], intrinsics[0]) for i in kept]
+        return CoarseFrames(images, intrinsics, times_s[kept], T)
+
+
+def clear_of_edges(depth_m: Float32, focal_px: float) -> Float32:
+    """depth_m (H, W), NaN = none, without the pixels beside a step in depth or beside none.
+
+    A point looked up there may meet what stands behind it or beside it, more from one side than from the other: a hand
+    before the thigh then seems to move as the camera goes round.
+    """
+    z = np.nan_to_num(depth_m)
+    step = np.maximum(np.float32(EDGE_M), np.float32(EDGE_PX / focal_px) * z)
+    near = np.ones((3, 3), np.uint8)
+    at_edge = (cv2.dilate(z, near) - z > step) | (z - cv2.erode(z, near) > step)
+    return np.where(at_edge, np.float32(np.nan), depth_m)

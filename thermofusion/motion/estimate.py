@@ -30,8 +30,8 @@ POINTS_M, LOOK_M = 0.02, 0.025  # of the points that are compared with frames, a
 KNOT_FRAMES, KNOT_S = 10, 0.65  # between knots: linear in between, 0.16 mm of such motion is left
 # Where measurements are looked for, and from where on they count less, by iteration: against the smeared surface of the
 # rigid fusion, then against one that was fused at rest.
-SMEARED_M = ((0.06, 0.02), (0.06, 0.015), (0.06, 0.01), (0.05, 0.007))
-SHARP_M = ((0.05, 0.007), (0.04, 0.005), (0.03, 0.004))
+SMEARED_M = ((0.06, 0.02), (0.06, 0.015), (0.04, 0.01), (0.03, 0.007))
+SHARP_M = ((0.03, 0.007), (0.02, 0.005), (0.02, 0.004))
 LEFT_OUT = 4  # every fourth frame judges
 STILL = 0.5  # `unrest` below it: noise
 MIN_GAIN = 0.02  # share by which the left-out residual must fall: of all points, most of which hardly move

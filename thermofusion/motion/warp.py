@@ -52,7 +52,8 @@ class Warp:
         self._low, self._high = vertices.min(0), vertices.max(0)
 
     def __call__(self, depth_m: Float32, T_world_depth: Float, time_s: float) -> Float32:
-        """depth_m (H, W) at rest, NaN where nothing of the subject is seen."""
+        """depth_m (H, W) at rest, NaN where nothing is seen; below 0 where the look goes past the subject: minus the
+        depth of what stands behind. Without it fingers swell, for nothing says where they end."""
         box = self._box(T_world_depth)
         out = np.full(depth_m.shape, np.nan, np.float32)
         if box is None:
@@ -81,8 +82,9 @@ class Warp:
             borderValue=float("nan"),
         )
         at_rest = there - full[..., 2]
-        near = np.abs(at_rest - full[..., 3]) < np.float32(OFF_M)
-        out[rows, columns] = np.where(near, at_rest, np.float32(np.nan))
+        behind = at_rest - full[..., 3]
+        near, past = np.abs(behind) < np.float32(OFF_M), behind >= np.float32(OFF_M)
+        out[rows, columns] = np.where(near, at_rest, np.where(past, -there, np.float32(np.nan)))
         return out
 
     def _box(self, T_world_depth: Float) -> tuple[slice, slice] | None:

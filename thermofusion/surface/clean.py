@@ -39,13 +39,15 @@ class RemovedPart:
 
 @dataclass(frozen=True, eq=False)
 class Cleaned:
-    """What is left: vertices_m (V, 3), triangles (F, 3). floor_plane : (4,) `[n, d]` of the floor found, or None."""
+    """What is left: vertices_m (V, 3), triangles (F, 3). floor_plane : (4,) `[n, d]` of the floor found, or None.
+    floor_top_m : up to where it was taken away: more than the clearance where it was smeared into layers."""
 
     vertices_m: Float32
     triangles: Int
     floor_plane: Float | None
     removed: tuple[RemovedPart, ...]
     messages: tuple[str, ...]
+    floor_top_m: float = 0.0
 
 
 def subject_only(
@@ -80,7 +82,7 @@ def subject_only(
         removed.append(RemovedPart(reason, 1e4 * float(vertex_areas(vertices, triangles)[~stays].sum()), 1))
         vertices, triangles = keep_vertices(vertices, triangles, stays)
     vertices, triangles, others = _pieces(vertices, triangles, survey, plan, subject)
-    return Cleaned(vertices, triangles, floor, (*removed, *others), tuple(messages))
+    return Cleaned(vertices, triangles, floor, (*removed, *others), tuple(messages), floor_top_m)
 
 
 def _height(plane: Float, points: Float32) -> Float32:

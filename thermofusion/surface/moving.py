@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..geometry.mesh import canonical, keep_vertices, mesh_normals
+from ..geometry.plane import FLOOR_NORMAL_COS
 from ..motion.body import BodyMotion
 from ..motion.coarse import Remembering
 from ..motion.estimate import Solution, estimate
@@ -118,7 +119,10 @@ def at_rest(
     vertices, triangles = found
     if first.floor_plane is not None:
         plane = first.floor_plane.astype(np.float32)
-        stays = vertices @ plane[:3] + plane[3] >= subject.floor_clearance_mm / 1e3
+        height = vertices @ plane[:3] + plane[3]
+        level = mesh_normals(vertices, triangles) @ plane[:3] > FLOOR_NORMAL_COS
+        layer = level & (height < first.floor_top_m)  # of a floor smeared into layers: feet stay, floor goes
+        stays = (height >= subject.floor_clearance_mm / 1e3) & ~layer
         vertices, triangles = keep_vertices(vertices, triangles, stays)
     alone = subject.model_copy(update={"floor": "keep"})
     return subject_only(vertices, triangles, survey, plan, subject=alone, floor_plane=None)

@@ -228,12 +228,16 @@ class VoxelGrid:
         return self._blocks(depth, self._o3d.core.Tensor(invert(T_world_depth))).numpy()
 
     def integrate(self, depth_m: Float32, T_world_depth: Float) -> bool:
-        """Average a frame, depth_m (H, W) at T_world_depth (4, 4), into the field.
+        """Average a frame, depth_m (H, W) at T_world_depth (4, 4), into the field. A depth below 0 is a look past the
+        subject: it empties what is nearer and asks for no surface where it ends.
 
         False, with the field unchanged, if that needs more blocks than allowed. The table is enlarged before the blocks
         go in: one that overflows while they do loses blocks, and the surface gets holes.
         """
-        depth, extrinsic = self._depth(depth_m), self._o3d.core.Tensor(invert(T_world_depth))
+        whole, extrinsic = self._depth(depth_m), self._o3d.core.Tensor(invert(T_world_depth))
+        depth = whole
+        if whole.min() < 0:
+            depth, whole = np.maximum(whole, np.float32(0)), np.abs(whole)
         blocks, table = self._blocks(depth, extrinsic), self._grid.hashmap()
         if len(blocks) == 0:
             return True
@@ -243,7 +247,7 @@ class VoxelGrid:
                 return False
             if needed > 0.95 * table.capacity():
                 table.reserve(int(max(needed, table.capacity()) * GROWTH) + 8)
-        image = self._o3d.t.geometry.Image(self._o3d.core.Tensor(depth))
+        image = self._o3d.t.geometry.Image(self._o3d.core.Tensor(whole))
         self._grid.integrate(blocks, image, self._K, extrinsic, 1.0, self._plan.max_range_m, self._multiplier)
         return True
 
