@@ -30,6 +30,7 @@ from .odometry import GrowingSegment, Segment, odometry
 from .recorded import believed
 from .registration import register_view
 from .relocalise import find_join
+from .still import held_against_pictures
 
 ROUNDS = ((0.08, 4), (0.03, 2), (0.015, 1))  # of the joint solution: reach of partners in m, every how many points
 PARTNERS_PER_FRAGMENT = 8  # overlaps kept of each, about
@@ -127,7 +128,8 @@ def track(
     """Track the depth camera through a scan; a recorded trajectory, if there is one, is the start.
 
     depth : the scan's frames, if they are at hand. ahead : what was tracked while it was recorded; used up.
-    Raises ScanError if no frame shows the subject.
+    Raises ScanError if no frame shows the subject, QualityError if the camera seems to stand still though its pictures
+    change.
     """
     frames = TrackingFrames.of(scan, input=input, subject=subject, tracking=tracking, depth=depth)
     indices = np.flatnonzero(scan.depth.usable)
@@ -146,7 +148,11 @@ def track(
     placed, lost = _join(segments, scan.depth.times_s, tracking)
     placed, loops, converged = _solve(placed, tracking)
     poses = _refined(placed) if tracking.refine_to_model else [p.frame_poses() for p in placed]
-    return _result(frames, placed, poses, lost, loops, converged)
+    result = _result(frames, placed, poses, lost, loops, converged)
+    if scan.trajectory is None:
+        alone = subject.background == "remove"
+        held_against_pictures(frames, result.trajectory.T_world_depth, result.tracked, alone=alone)
+    return result
 
 
 @dataclass(frozen=True, eq=False)
