@@ -40,7 +40,7 @@ def filter_depth(depth_m: Float32, camera: Camera, section: InputSection) -> Flo
     The camera's lens distortion is neglected in the angle (a degree at most); see `DepthUndistorter` for the pixels.
     """
     depth = np.where((depth_m >= section.min_depth_m) & (depth_m <= section.max_depth_m), depth_m, np.float32(np.nan))
-    box = _bounding_box(depth)
+    box = bounding_box(depth)
     if box is None:
         return depth
     part = depth[box]
@@ -50,7 +50,7 @@ def filter_depth(depth_m: Float32, camera: Camera, section: InputSection) -> Flo
     return depth
 
 
-def _bounding_box(depth: Float32) -> tuple[slice, slice] | None:
+def bounding_box(depth: Float32) -> tuple[slice, slice] | None:
     """The rows and columns that hold any depth: a person fills a third of the image, so most work is saved."""
     valid = depth == depth  # False where NaN
     rows, cols = np.flatnonzero(valid.any(1)), np.flatnonzero(valid.any(0))
@@ -192,7 +192,7 @@ class DepthFrames:
             depth[box] = part
             return depth
         depth = filter_depth(self._undistort(self._stream.load(i)), self.camera, self._section)
-        if self._room_bytes > 0 and (found := _bounding_box(depth)) is not None:
+        if self._room_bytes > 0 and (found := bounding_box(depth)) is not None:
             self._kept[i] = found, depth[found].copy()
             self._room_bytes -= self._kept[i][1].nbytes
         return depth

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..depth.filter import DepthFrames, read_ahead
+from ..depth.filter import DepthFrames, bounding_box, read_ahead
 from ..depth.subject import SubjectFrames
 from ..geometry.camera import project
 from ..geometry.rigid import transform_points
@@ -140,8 +140,13 @@ def coarse_depth(depth_m: Float32, step: int) -> Float32:
     """
     if step == 1:
         return depth_m
-    h, w = (n // step * step for n in depth_m.shape)
-    parts = [depth_m[r:h:step, c:w:step] for r in range(step) for c in range(step)]
+    whole = np.full([n // step for n in depth_m.shape], np.nan, np.float32)
+    box = bounding_box(depth_m)
+    if box is None:
+        return whole
+    cells = tuple(slice(of.start // step, min(-(-of.stop // step), n)) for of, n in zip(box, whole.shape, strict=True))
+    inside = depth_m[tuple(slice(of.start * step, of.stop * step) for of in cells)]
+    parts = [inside[r::step, c::step] for r in range(step) for c in range(step)]
     total, count = np.zeros_like(parts[0]), np.zeros(parts[0].shape, np.uint8)
     low, high = parts[0], parts[0]
     for part in parts:
@@ -150,7 +155,8 @@ def coarse_depth(depth_m: Float32, step: int) -> Float32:
         count += valid
         low, high = np.fmin(low, part), np.fmax(high, part)
     good = (2 * count >= len(parts)) & (high - low < np.float32(CELL_SPREAD) * low)
-    return np.divide(total, count, out=np.full_like(total, np.nan), where=good)
+    np.divide(total, count, out=whole[cells], where=good)
+    return whole
 
 
 def local_contrast(grey: Float32, step: int) -> Float32:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from ..depth.filter import bounding_box
 from ..types import Float, Float32
 
 NORMAL_WINDOW_PX = 5  # slopes are least-squares fits over this square: wide enough to average noise
@@ -36,10 +37,15 @@ class DepthMap:
         """From an image depth_m (H, W), NaN = none, and an intensity image (H, W) of the same view."""
         fx, fy, cx, cy = intrinsics
         h, w = depth_m.shape
-        x = ((np.arange(w) - cx) / fx).astype(np.float32)
-        y = ((np.arange(h) - cy) / fy).astype(np.float32)
-        points = np.stack([x[None] * depth_m, y[:, None] * depth_m, depth_m], axis=-1)
-        surface = np.concatenate([points, _normals(depth_m, x, y, fx, fy)], axis=-1).reshape(-1, 6)
+        whole = np.full((h, w, 6), np.nan, np.float32)
+        rows, columns = box = _around(depth_m, NORMAL_WINDOW_PX // 2)
+        x = ((np.arange(w)[columns] - cx) / fx).astype(np.float32)
+        y = ((np.arange(h)[rows] - cy) / fy).astype(np.float32)
+        if len(x) and len(y):
+            part, depth = whole[box], depth_m[box]
+            part[..., 0], part[..., 1], part[..., 2] = x * depth, y[:, None] * depth, depth
+            part[..., 3:] = _normals(depth, x, y, fx, fy)
+        surface = whole.reshape(-1, 6)
         good = np.flatnonzero(np.isfinite(surface[:, 3]))
         # an even sample in image order: same input, same sample
         pick = good[np.linspace(0, len(good) - 1, min(samples, len(good))).astype(np.intp)] if len(good) else good
@@ -51,6 +57,15 @@ class DepthMap:
     def sample_only(self) -> DepthMap:
         """Without the image: what is left can be sent to other views, and takes little memory."""
         return replace(self, surface=np.empty((0, 6), np.float32), texture=None)
+
+
+def _around(depth_m: Float32, margin_px: int) -> tuple[slice, slice]:
+    """The rows and columns of an image (H, W) that hold depth, and a margin: a person fills a third of it."""
+    box = bounding_box(depth_m)
+    if box is None:
+        return slice(0, 0), slice(0, 0)
+    rows, columns = (slice(max(0, int(of.start) - margin_px), int(of.stop) + margin_px) for of in box)
+    return rows, columns
 
 
 def _normals(depth_m: Float32, x: Float32, y: Float32, fx: float, fy: float) -> Float32:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.rigid import invert, se3_exp
+from ..geometry.rigid import invert, se3_exp, transform_points
 from ..robust import mad_sigma
 from ..types import Float
 from .maps import DepthMap
@@ -75,25 +75,25 @@ def find_partners(
 
     T_target_source : (4, 4). stride : only every so many points.
     """
-    R, t = T_target_source[:3, :3], T_target_source[:3, 3]
-    p = source.sample[::stride] @ R.T + t
+    sample = source.sample[::stride]
+    p = transform_points(T_target_source, sample)
     pixel, inside, off_px = _pixels(target, p)
-    there = target.surface[pixel].astype(np.float64)
-    n, d = there[:, 3:], p[inside] - there[:, :3]
+    there = target.surface.take(pixel, axis=0).astype(np.float64)
+    n, d = there[:, 3:], p.take(inside, axis=0) - there[:, :3]
     r = np.einsum("ij,ij->i", d, n)
-    facing = np.einsum("ij,ij->i", source.sample_normals[::stride][inside] @ R.T, n)
-    with np.errstate(invalid="ignore"):
-        good = (np.abs(r) < reach_m) & (np.einsum("ij,ij->i", d, d) < (3 * reach_m) ** 2)
-        good &= facing > np.cos(np.radians(MAX_NORMAL_DEG))
-    chosen = inside[good]
+    good = np.flatnonzero((np.abs(r) < reach_m) & (np.einsum("ij,ij->i", d, d) < (3 * reach_m) ** 2))
+    own_n = source.sample_normals[::stride].take(inside.take(good), axis=0) @ T_target_source[:3, :3].T
+    good = good[np.einsum("ij,ij->i", own_n, n.take(good, axis=0)) > np.cos(np.radians(MAX_NORMAL_DEG))]
+    chosen, there = inside.take(good), there.take(good, axis=0)
+    p = p.take(chosen, axis=0)
     color = None
     if target.texture is not None and source.sample_intensity is not None:
-        texture = target.texture[pixel[good]].astype(np.float64)
-        own = source.sample_intensity[::stride][chosen]
-        color = _color_rows(p[chosen], own, texture, off_px[good], *target.intrinsics[:2])
-    share = float(good.mean()) if len(good) else 0.0
-    bias = RANGE_BIAS_1_M * np.abs(source.sample[::stride][chosen, 2] ** 2 - there[good, 2] ** 2)
-    return Partners(Rows(p[chosen], n[good], r[good], bias), color, share, len(source.sample[::stride]))
+        texture = target.texture.take(pixel.take(good), axis=0).astype(np.float64)
+        own = source.sample_intensity[::stride].take(chosen)
+        color = _color_rows(p, own, texture, off_px.take(good, axis=0), *target.intrinsics[:2])
+    share = len(good) / max(len(inside), 1)
+    bias = RANGE_BIAS_1_M * np.abs(sample[:, 2].take(chosen) ** 2 - there[:, 2] ** 2)
+    return Partners(Rows(p, there[:, 3:], r.take(good), bias), color, share, len(sample))
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def seen_from(source: DepthMap, target: DepthMap, T_target_source: Float, reach_
     T_target_source : (4, 4). reach_m, stride : of `find_partners`.
     """
     partners = find_partners(source, target, T_target_source, reach_m, stride)
-    p = source.sample[::stride] @ T_target_source[:3, :3].T + T_target_source[:3, 3]
+    p = transform_points(T_target_source, source.sample[::stride])
     n = source.sample_normals[::stride] @ T_target_source[:3, :3].T
     pixel, ahead, _ = _pixels(target, p)
     front = np.einsum("ij,ij->i", p[ahead], n[ahead]) < 0  # what turns its back is hidden by itself
@@ -133,12 +133,13 @@ def _pixels(target: DepthMap, p: Float) -> tuple[NDArray[np.intp], NDArray[np.in
     each falls from the pixel's centre, (N, 2)."""
     fx, fy, cx, cy = target.intrinsics
     h, w = target.shape
-    z = np.maximum(p[:, 2], 1e-3)
-    u, v = p[:, 0] / z * fx + cx, p[:, 1] / z * fy + cy
+    x, y, z = np.ascontiguousarray(p.T)
+    near = np.maximum(z, 1e-3)
+    u, v = x / near * fx + cx, y / near * fy + cy
     column, row = np.rint(u), np.rint(v)
-    inside = np.flatnonzero((p[:, 2] > 0.1) & (column >= 0) & (row >= 0) & (column < w) & (row < h))
-    pixel = row[inside].astype(np.intp) * w + column[inside].astype(np.intp)
-    return pixel, inside, np.stack([u - column, v - row], axis=1)[inside]
+    inside = np.flatnonzero((z > 0.1) & (column >= 0) & (row >= 0) & (column < w) & (row < h))
+    pixel = (row * w + column).take(inside).astype(np.intp)
+    return pixel, inside, np.stack([(u - column).take(inside), (v - row).take(inside)], axis=1)
 
 
 def _color_rows(p: Float, intensity: Float, texture: Float, off_px: Float, fx: float, fy: float) -> Rows:
@@ -173,7 +174,7 @@ def normal_equations(partners: Partners, T_world_target: Float) -> tuple[Float, 
 
 def _accumulate(rows: Rows, w: Float, T_world_target: Float) -> tuple[Float, Float]:
     R = T_world_target[:3, :3]
-    x, n = rows.points @ R.T + T_world_target[:3, 3], rows.directions @ R.T
+    x, n = transform_points(T_world_target, rows.points), rows.directions @ R.T
     J = np.empty((len(x), 6))
     J[:, 0] = x[:, 1] * n[:, 2] - x[:, 2] * n[:, 1]
     J[:, 1] = x[:, 2] * n[:, 0] - x[:, 0] * n[:, 2]
