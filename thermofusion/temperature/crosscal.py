@@ -47,7 +47,7 @@ SUPPORT_CELLS = 24  # across the image; the field is known in those that hold so
 SUPPORT_ROWS, SUPPORT_VIEWS = 25, 3
 CURVE_M = 1e-5  # cubes of the curve along which vertices are drawn: no two vertices share one
 MIN_SHARED = 20  # vertices that two views must share to count as overlapping
-SENSOR_MODES = 48  # of the covariance, where a sensor's pattern is in it: its errors are many and small
+SENSOR_MODES = 100  # of the covariance, where a sensor's pattern is in it: its errors are many and small
 READINGS_ALIKE = 0.01  # chance below which references' scatter is no chance
 NORMALS_VIEWS, NORMALS_ROWS = 5, 5000  # that the normals' sigma is estimated from
 NORMALS_HIDDEN = 1.6  # part of a normal's error is the same for all views of a vertex: 1.2° shows as 0.7-0.8°
@@ -123,7 +123,10 @@ class Calibration:
 
     def error_modes(self, count: int) -> Callable[[Observations, NDArray], Float32]:
         """How the strongest error modes of this calibration shift observations: (rows, x of rows) -> (N, R)."""
-        modes = covariance_modes(self.covariance, count if self.sensor is None else SENSOR_MODES).astype(np.float32)
+        modes = covariance_modes(self.covariance, count if self.sensor is None else SENSOR_MODES)
+        if self.sensor is not None:  # what the weaker modes hold is not lost: the others bear it
+            modes *= np.sqrt(np.trace(self.covariance) / np.sum(modes**2))
+        modes = modes.astype(np.float32)
         at, n = self.layout, ERROR_RASTER
         du, dv = self.field.width_px / n, self.field.height_px / n
         v, u = (np.mgrid[0:n, 0:n].reshape(2, -1) + 0.5) * np.array([[dv], [du]])

@@ -17,7 +17,7 @@ from scipy.sparse import csr_matrix, hstack
 from ...types import Float
 
 FIXED_SPACING = (80 / 640, 27 / 640)  # image widths between the knots of fixed patterns: blotches, and dust
-DRIFT_SPACING = 100 / 640  # image widths between the knots of a drift
+DRIFT_SPACING = 85 / 640  # image widths between the knots of a drift: wider ones lose a tenth of it
 DRIFT_LENGTH = 0.2  # image widths over which a drift is alike
 BORDER_GROWTH = 1.5  # a drift's amplitude at the picture's corner over that in its middle, less one third of it
 BEND = 0.5  # amplitude of the bend √τ - τ over that of the straight rise τ
