@@ -17,18 +17,19 @@ from thermofusion.geometry.outline import OutlineCaster, project_contour
 from thermofusion.geometry.rigid import invert, se3_exp, transform_points
 from thermofusion.motion.body import moved_by
 from thermofusion.motion.coarse import clear_of_edges
-from thermofusion.motion.estimate import STILL, estimate, look_points
+from thermofusion.motion.estimate import STILL, Solution, estimate, look_points
 from thermofusion.motion.field import MotionField, affine, displacement, rotations
 from thermofusion.motion.gauge import common_motion, poses_without, without
 from thermofusion.motion.graph import MAX_NODES, bind, build_graph
 from thermofusion.motion.parts import name_parts
 from thermofusion.motion.rest import unrest
-from thermofusion.motion.rows import CoarseFrames
+from thermofusion.motion.rows import CoarseFrames, LeftOver
 from thermofusion.motion.solve import Tridiagonal
-from thermofusion.motion.told import amplitudes, ranges
+from thermofusion.motion.told import amplitudes, described, joined, ranges
 from thermofusion.motion.warp import RestSurface, Warp
 from thermofusion.phantom.scene import ShapeConfig
 from thermofusion.phantom.shapes import build_shape
+from thermofusion.report.summary import _moved_too_much
 from thermofusion.types import Camera, SurfaceMesh
 
 SMALL = Camera(160, 120, np.array([[140.0, 0, 79.5], [0, 140, 59.5], [0, 0, 1]]))
@@ -264,3 +265,28 @@ def test_a_look_past_the_body_is_minus_what_stands_behind(body):
     assert not np.isfinite(alone[past]).any()
     near = cv2.dilate(np.isfinite(alone).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
     assert past[near & ~np.isfinite(alone)].mean() > 0.99
+
+
+@pytest.mark.parametrize(("swing_m", "seen"), [(0.01, ()), (0.06, ((10.0, 20.0),))])
+def test_motion_too_quick_for_its_knots_is_told_with_its_time(body, swing_m, seen):
+    """The upper half swings to and fro within 4 s, from 10 s to 20 s: by 1 cm it is followed, by 6 cm it is not."""
+    graph = build_graph(body.vertices_m, body.triangles, 0.15)
+    knots = np.linspace(0, 30, 47)
+    twist = np.zeros((47, len(graph), 6))
+    swing = swing_m * np.sin(2 * np.pi * knots / 4) * ((knots > 10) & (knots < 20))
+    high = graph.at_m[:, 2] > 0
+    twist[:, high, 3] = swing[:, None]
+    points = body.vertices_m[::10]
+    left = LeftOver(0.7, np.full(len(points), 0.7), np.linspace(0, 30, 100), np.zeros(100))
+    field = MotionField(graph.at_m, knots, twist)
+    solution = Solution(field, body, graph.binding, np.zeros((100, 6)), 2.0, left, points)
+    path = walk(12.0)
+    told = described(body, solution, graph.binding, path, np.array([0, 0, 1.0]))
+    np.testing.assert_allclose(told.too_much, seen, atol=1.3)
+    low = body.vertices_m[:, 2] < -0.15
+    assert not told.unsettled[low].any()
+    assert told.unsettled[body.vertices_m[:, 2] > 0.15].all() == bool(seen)
+    assert joined(((4.0, 6.0), (1.0, 3.0), (2.0, 4.5), (8.0, 9.0))) == ((1.0, 6.0), (8.0, 9.0))
+    sentence = _moved_too_much(told.too_much)
+    assert (sentence != []) == bool(seen)
+    assert all("the subject moved too much between 10 s and 2" in text for text in sentence)

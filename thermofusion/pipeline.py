@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 # A stage is handed exactly the recipe sections that its key holds. It also depends on all stages before it.
 STAGES = (
     Stage("tracking", ("input", "subject", "tracking")),
-    Stage("surface", ("input", "subject", "surface"), edition=6),
+    Stage("surface", ("input", "subject", "surface"), edition=7),
     Stage("rig", ("input", "rig"), edition=4),
     Stage("mapping", ("input", "mapping"), edition=12),
     Stage("temperature", ("mapping", "temperature"), edition=13, handed_out=RESULT),

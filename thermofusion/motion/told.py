@@ -18,6 +18,7 @@ from .parts import name_parts
 
 UNSETTLED_SIGMAS = 2.0  # rms of a point in frames left out: 0.6 where motion is followed
 FAR_SHARE = 0.10  # of what a frame sees: if so much is farther off than noise, the motion was not followed
+BENT_M = 3e-3  # by which a node's motion misses a line between knots: what is in between is not known that well
 LEAST_BAD = 3  # such frames of those left out, in a row
 
 
@@ -73,17 +74,42 @@ def described(mesh: SurfaceMesh, solution: Solution, binding: Binding, trajector
     """Everything that is stored and told of a motion. mesh, binding : at rest. up : (3,) unit."""
     field, left = solution.field, solution.after
     nearest = cKDTree(solution.point_m).query(mesh.vertices_m)[1]
+    bent, area = bends(field) > BENT_M, np.zeros(len(field.node_m))
+    group = np.bincount(binding.group, minlength=len(binding.node))  # vertices of each
+    np.add.at(area, binding.node, binding.weight * group[:, None])
+    quick = (bent @ area) > FAR_SHARE * area.sum()
+    lost = bent.mean(0) > FAR_SHARE  # nodes that are too quick too often
     return BodyMotion(
         field=field,
         binding=binding,
         trajectory=trajectory,
         moved_mm=(1e3 * amplitudes(mesh, field, binding)).astype(np.float32),
-        unsettled=left.of_point[nearest] > UNSETTLED_SIGMAS,
+        unsettled=(left.of_point[nearest] > UNSETTLED_SIGMAS) | lost[binding.node[:, 0]][binding.group],
         parts=part_motions(mesh, field, binding, up),
         left_out_before=solution.before,
         left_out_after=left.rms,
-        too_much=ranges(left.times_s, left.far_share > FAR_SHARE),
+        too_much=joined(ranges(left.times_s, left.far_share > FAR_SHARE) + ranges(field.knot_s[1:-1], quick)),
     )
+
+
+def bends(field: MotionField) -> Float:
+    """(F - 2, K) m, about how far each node is, half-way between knots, from the line that stands for its motion.
+
+    Of a motion with acceleration a, linear over steps h, a h²/8 is missed: an eighth of the second difference.
+    """
+    x = field.twist[:, :, 3:]
+    return np.asarray(np.linalg.norm(x[:-2] - 2 * x[1:-1] + x[2:], axis=2) / 8)
+
+
+def joined(stretches: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    """(start, stop) s in order, those that overlap made one."""
+    out: list[tuple[float, float]] = []
+    for start, stop in sorted(stretches):
+        if out and start <= out[-1][1]:
+            out[-1] = out[-1][0], max(out[-1][1], stop)
+        else:
+            out.append((start, stop))
+    return tuple(out)
 
 
 def ranges(times_s: Float, bad: Bool) -> tuple[tuple[float, float], ...]:
