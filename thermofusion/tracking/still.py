@@ -19,7 +19,7 @@ from .maps import DepthMap
 STILL_DEG, STILL_M = 4.0, 0.05  # a path that stays within these, at 1 m, barely moves: nobody walks round a thing so
 FRAMES = 12  # of the path, evenly spread, that are held against the first
 CHANGED_M = 0.02  # at 1 m, grows with range²: several times noise, and what a centimetre of pose leaves on a slope
-CHANGED = 0.02  # share of what both see: less than 0.001 of what stands still, 0.03-0.06 of three real turntables
+CHANGED = 0.02  # share of what both see: up to 0.014 of what stands still, 0.03-0.06 of three real turntables
 CHANGED_ALONE = 0.25  # likewise where the subject alone is tracked: arms move, and a body's motion is solved later
 THERMAL_CHANGED = 0.05  # share of the thermal picture likewise: the same turntables show 0.10-0.28
 CONTRAST = 0.1  # of a thermal picture's own range: a pixel that differs by more has changed,
