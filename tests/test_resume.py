@@ -9,6 +9,7 @@ from typing import Literal, get_args, get_origin
 import numpy as np
 import pytest
 from pydantic import BaseModel
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from thermofusion.errors import ThermofusionError
 from thermofusion.files.strict import _bounds
@@ -134,3 +135,27 @@ def test_a_finished_result_is_taken_back_into_the_world(scan, tmp_path):
     assert resumed.mesh.metadata == fresh.mesh.metadata
     np.testing.assert_array_equal(resumed.mesh.surface.vertices_m, fresh.mesh.surface.vertices_m)
     np.testing.assert_array_equal(resumed.mesh.temperature_degC, fresh.mesh.temperature_degC)
+
+
+@pytest.mark.parametrize("folder", [True, False])
+def test_blas_has_one_thread_whoever_calls(folder, scan, tmp_path):
+    """In a notebook, say, where nobody set it before NumPy was loaded; afterwards it is as it was."""
+
+    def threads():
+        return [lib["num_threads"] for lib in threadpool_info() if lib["user_api"] == "blas"]
+
+    seen = []
+    with threadpool_limits(2, user_api="blas"):
+        before = threads()
+        fuse(
+            scan,
+            load_recipe({}, BASE),
+            out=tmp_path if folder else None,
+            progress=lambda *_: seen.append(threads()),
+            until="mapping",
+        )
+        assert threads()[: len(before)] == before
+    assert before
+    assert max(before) == 2
+    assert seen
+    assert {n for counts in seen for n in counts} == {1}

@@ -14,6 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from threadpoolctl import threadpool_limits
+
 from .errors import RecipeError, ScanError
 from .files.reading import read_json
 from .progress import Progress, silent
@@ -82,12 +84,22 @@ def go_on(
 
 
 def _written(run: _Run, overwrite: bool) -> Result:
-    """The result of a run, in its folder if it has one."""
+    """The result of a run, in its folder if it has one.
+
+    BLAS has one thread meanwhile, whoever calls: more only wait for each other (see `cli`), and sums would depend on
+    their number.
+    """
+    import scipy.linalg  # noqa: F401 - its BLAS is another one than NumPy's, and can be held once it is loaded
+
     scan, recipe = run.scan, run.recipe
     verify(scan)
     if run.folder is None:
-        return run.result()
-    with claimed(run.folder, scan, names_of(recipe), overwrite=overwrite) as left:
+        with threadpool_limits(1, user_api="blas"):
+            return run.result()
+    with (
+        threadpool_limits(1, user_api="blas"),
+        claimed(run.folder, scan, names_of(recipe), overwrite=overwrite) as left,
+    ):
         result = run.result()
         finished = None if result.mapped is None else (STAGES[-1].file, run.stages.note)
         write_result(result, recipe, run.folder, left, run.casts, finished)
