@@ -47,7 +47,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "motion": BASE,
     "surface": (*BASE, "depth", "motion"),
     "rig": (*BASE, "physics", "motion"),
-    "mapping": (*BASE, "physics", "motion", "rig"),
+    "mapping": (*BASE, "physics", "motion", "rig", "scans"),
     "temperature": (*BASE, "physics", "mapping"),
     "diagnosis": (*BASE, "mapping", "temperature"),
     "export": BASE,

@@ -166,12 +166,21 @@ def test_stretches_of_too_much_motion_are_joined():
     assert ranges(np.arange(4.0), np.array([1, 1, 0, 0], bool)) == ()
 
 
-def test_frames_are_brought_to_rest(body):
-    """A body that leans is seen upright again, to the size of a pixel's slope; without motion nothing changes."""
+def before_a_camera(body):
+    """A camera, a graph of the body, a pose (4, 4) from which it sees it, and a motion that is none."""
     camera = Camera(320, 240, np.array([[280.0, 0, 159.5], [0, 280, 119.5], [0, 0, 1]]))
     graph = build_graph(body.vertices_m, body.triangles, 0.15)
-    T = walk(12.0, tremor=0.0).T_world_depth[10]
-    zero = MotionField.at_rest(graph.at_m, np.array([0.0, 1.0]))
+    return (
+        camera,
+        graph,
+        walk(12.0, tremor=0.0).T_world_depth[10],
+        MotionField.at_rest(graph.at_m, np.array([0.0, 1.0])),
+    )
+
+
+def test_frames_are_brought_to_rest(body):
+    """A body that leans is seen upright again, to the size of a pixel's slope; without motion nothing changes."""
+    camera, graph, T, zero = before_a_camera(body)
     rest = depth_of(body, camera, T)
     same = Warp(RestSurface(body.vertices_m, body.triangles, graph.binding, zero), camera)(rest, T, 0.5)
     np.testing.assert_allclose(same, rest, atol=1e-6)
@@ -253,10 +262,7 @@ def test_what_stands_behind_an_edge_is_not_looked_up():
 
 def test_a_look_past_the_body_is_minus_what_stands_behind(body):
     """So that the fusion knows where a finger ends; nothing of it comes to rest."""
-    camera = Camera(320, 240, np.array([[280.0, 0, 159.5], [0, 280, 119.5], [0, 0, 1]]))
-    graph = build_graph(body.vertices_m, body.triangles, 0.15)
-    T = walk(12.0, tremor=0.0).T_world_depth[10]
-    zero = MotionField.at_rest(graph.at_m, np.array([0.0, 1.0]))
+    camera, graph, T, zero = before_a_camera(body)
     alone = depth_of(body, camera, T)
     seen = np.where(np.isfinite(alone), alone, np.float32(2.5))
     rest = Warp(RestSurface(body.vertices_m, body.triangles, graph.binding, zero), camera)(seen, T, 0.5)

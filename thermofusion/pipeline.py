@@ -93,17 +93,14 @@ def _written(run: _Run, overwrite: bool) -> Result:
 
     scan, recipe = run.scan, run.recipe
     verify(scan)
-    if run.folder is None:
-        with threadpool_limits(1, user_api="blas"):
+    with threadpool_limits(1, user_api="blas"):
+        if run.folder is None:
             return run.result()
-    with (
-        threadpool_limits(1, user_api="blas"),
-        claimed(run.folder, scan, names_of(recipe), overwrite=overwrite) as left,
-    ):
-        result = run.result()
-        finished = None if result.mapped is None else (STAGES[-1].file, run.stages.note)
-        write_result(result, recipe, run.folder, left, run.casts, finished)
-        return result
+        with claimed(run.folder, scan, names_of(recipe), overwrite=overwrite) as left:
+            result = run.result()
+            finished = None if result.mapped is None else (STAGES[-1].file, run.stages.note)
+            write_result(result, recipe, run.folder, left, run.casts, finished)
+            return result
 
 
 def ready() -> None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..geometry.camera import pixel_rays, project
 from ..geometry.rigid import interpolate_trajectory, invert, transform_points
+from ..scans.pairing import nearest_in_time
 from ..types import Bool, Camera, Float, Float32, Scan, ThermalViews, Trajectory
 
 MAX_GAP_S = 0.25  # a depth frame farther in time from a view says nothing of it
@@ -68,16 +69,10 @@ class DepthWitness:
     def __init__(self, scan: Scan, trajectory: Trajectory, views: ThermalViews, lens: Camera, own_m: float) -> None:
         """trajectory : of the depth camera. own_m : how far behind the surface a vertex may lie."""
         self._stream, self._views, self._lens, self._own_m = scan.depth, views, lens, own_m
-        times_s = scan.depth.times_s
-        after = np.clip(np.searchsorted(times_s, views.times_s), 1, max(len(times_s) - 1, 1))
-        before = after - 1
-        after = np.minimum(after, len(times_s) - 1)
-        sooner = np.abs(times_s[before] - views.times_s) <= np.abs(times_s[after] - views.times_s)
-        self._frame = np.where(sooner, before, after)
-        poses, valid = interpolate_trajectory(trajectory, times_s[self._frame], max_gap_s=MAX_GAP_S)
+        self._frame, off_s = nearest_in_time(views.times_s, scan.depth.times_s)
+        poses, valid = interpolate_trajectory(trajectory, scan.depth.times_s[self._frame], max_gap_s=MAX_GAP_S)
         self._T_thermal_depth = invert(views.T_world_thermal) @ poses
-        near = np.abs(times_s[self._frame] - views.times_s) <= MAX_GAP_S
-        self._known = valid & near & scan.depth.usable[self._frame]
+        self._known = valid & (np.abs(off_s) <= MAX_GAP_S) & scan.depth.usable[self._frame]
         depth = scan.rig.depth
         v, u = np.mgrid[: depth.height_px // STEP, : depth.width_px // STEP] * STEP + 0.5 * (STEP - 1)
         rays = pixel_rays(depth, u, v)

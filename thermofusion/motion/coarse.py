@@ -35,11 +35,8 @@ class Remembering:
         size = 4 * (self.camera.width_px // self._step) * (self.camera.height_px // self._step)
         self._every = max(1, -(-count * size // MAX_BYTES))
         # one block: so many small ones cost more in pages than the pixels do
-        size_px = (
-            len(range(0, count, self._every)),
-            *(len(range(self._step // 2, n, self._step)) for n in self.camera.shape),
-        )
-        self._images: Float32 = np.empty(size_px, np.float32)
+        h, w = (len(range(self._step // 2, n, self._step)) for n in self.camera.shape)
+        self._images: Float32 = np.empty((len(range(0, count, self._every)), h, w), np.float32)
         self._kept: dict[int, int] = {}  # frame -> row of the images
 
     def read_ahead(self, frames: Sequence[int]) -> Iterator[tuple[int, Float32]]:

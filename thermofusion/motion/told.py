@@ -53,9 +53,8 @@ def part_motions(mesh: SurfaceMesh, field: MotionField, binding: Binding, up: Fl
     groups = len(binding.node)
     pair, of = np.unique(part[inside] * groups + binding.group[inside], return_inverse=True)
     p = _homogeneous(mesh)[inside]
-    total = np.stack(
-        [np.bincount(of, p[:, k]) for k in range(4)], axis=1
-    )  # of a part's vertices that are carried alike
+    # of a part's vertices that are carried alike
+    total = np.stack([np.bincount(of, p[:, k]) for k in range(4)], axis=1)
     share = csr_matrix((np.ones(len(pair)), (pair // groups, np.arange(len(pair)))), shape=(len(names), len(pair)))
     moved = [np.einsum("aij,aj->ai", D[pair % groups], total) for D in _of_groups(field, binding)]
     mean = np.array([share @ m for m in moved]) / np.maximum(count, 1)[:, None]

@@ -46,10 +46,7 @@ METHODS = ("nearest-view", "mean", "cos-resolution", "paper", "corrected-cos", "
 CAVITY_FRACTION = 0.2  # of the hemisphere: beyond it reflection between body parts exceeds 0.1 K
 CAVITY_K = 0.05  # that reflection adds at least: things as warm as the room add nothing
 HIGH_RESIDUAL = 3.0  # views disagree by more than this many of their own sigmas: hair, clothes, motion
-AGREE_K, APART_K = (
-    0.2,
-    0.6,
-)  # rms of views about a vertex: below the first nobody minds, beyond the second nothing excuses
+AGREE_K, APART_K = 0.2, 0.6  # rms of views of a vertex: below, nobody minds; beyond the other, nothing excuses
 PASSED_OVER_K = 0.85  # two views so far apart have an rms of `APART_K`
 ANGLE_ROWS, ANGLE_STEP_DEG, ANGLE_LEAST = 200_000, 5.0, 200  # of the plot over the angle: rows, bins, rows of a bin
 UNCERTAINTY_MEANS = "one sigma about the level common to all vertices; _absolute, where the level is known: with it"
@@ -129,12 +126,14 @@ def solve(
     result = blend(problem, calibration)
     progress("temperature", 4, 4)
     body_fraction = None if problem.around is None else problem.around.body_fraction
-    shown = _flagged(_mesh(mesh, result, calibration, _cavity(problem), problem.room, other), mapped.unsettled)
+    shown = _mesh(mesh, result, calibration, _cavity(problem), problem.room, other)
+    if mapped.unsettled.any():  # else it is empty: the subject stood still
+        shown = _flagged(shown, mapped.unsettled, VertexFlag.MOVED)
     if calibration is not None:
         against = contradicted(problem, mapped.observations, calibration, result, PASSED_OVER_K)
         against |= (shown.flags & VertexFlag.HIGH_RESIDUAL) > 0
         against |= doubtful_with_neighbours(against, result.count, problem.points_m)
-        shown = replace(shown, flags=shown.flags | np.where(against, VertexFlag.HIGH_RESIDUAL, 0).astype(np.uint8))
+        shown = _flagged(shown, against, VertexFlag.HIGH_RESIDUAL)
     return Temperature(
         mesh=shown,
         absolute_degC=_degC(result.absolute_K),
@@ -253,11 +252,9 @@ def _mesh(
     )
 
 
-def _flagged(mesh: ThermalMesh, unsettled: Bool) -> ThermalMesh:
-    """With MOVED where the subject's motion was not followed; unsettled : (V,), or (0,) for one that stood still."""
-    if not unsettled.any():
-        return mesh
-    return replace(mesh, flags=mesh.flags | np.where(unsettled, VertexFlag.MOVED, 0).astype(np.uint8))
+def _flagged(mesh: ThermalMesh, where: Bool, flag: VertexFlag) -> ThermalMesh:
+    """With a flag more on some of its vertices (V,)."""
+    return replace(mesh, flags=mesh.flags | np.where(where, flag, 0).astype(np.uint8))
 
 
 def _crosscal_report(c: Calibration, mapped: Mapped, problem: ThermalProblem, result: BlendResult) -> dict[str, Any]:

@@ -77,7 +77,7 @@ def find_partners(
     """
     sample = source.sample[::stride]
     p = transform_points(T_target_source, sample)
-    pixel, inside, off_px = _pixels(target, p)
+    pixel, inside, off_px = pixels_of(target, p)
     there = target.surface.take(pixel, axis=0).astype(np.float64)
     n, d = there[:, 3:], p.take(inside, axis=0) - there[:, :3]
     r = np.einsum("ij,ij->i", d, n)
@@ -114,7 +114,7 @@ def seen_from(source: DepthMap, target: DepthMap, T_target_source: Float, reach_
     partners = find_partners(source, target, T_target_source, reach_m, stride)
     p = transform_points(T_target_source, source.sample[::stride])
     n = source.sample_normals[::stride] @ T_target_source[:3, :3].T
-    pixel, ahead, _ = _pixels(target, p)
+    pixel, ahead, _ = pixels_of(target, p)
     front = np.einsum("ij,ij->i", p[ahead], n[ahead]) < 0  # what turns its back is hidden by itself
     depth = target.surface[pixel[front], 2]
     empty, through = np.isnan(depth), depth > p[ahead][front, 2] + reach_m
@@ -128,7 +128,7 @@ def agreement(a: DepthMap, b: DepthMap, T_b_a: Float, stride: int = 1) -> float:
     return agree / max(agree + one.conflict + other.conflict, 1)
 
 
-def _pixels(target: DepthMap, p: Float) -> tuple[NDArray[np.intp], NDArray[np.intp], Float]:
+def pixels_of(target: DepthMap, p: Float) -> tuple[NDArray[np.intp], NDArray[np.intp], Float]:
     """Flat pixel of each point of the target's frame that falls inside its image; which points those are; and how far
     each falls from the pixel's centre, (N, 2)."""
     fx, fy, cx, cy = target.intrinsics

@@ -12,9 +12,11 @@ import numpy as np
 from ..errors import QualityError
 from ..geometry.rigid import invert, rotation_angle_deg, transform_points
 from ..robust import mad_sigma
+from ..scans.pairing import nearest_in_time
 from ..types import Bool, Float, ThermalStream
 from .frames import TrackingFrames
 from .maps import DepthMap
+from .registration import pixels_of
 
 STILL_DEG, STILL_M = 4.0, 0.05  # a path that stays within these, at 1 m, barely moves: nobody walks round a thing so
 FRAMES = 12  # of the path, evenly spread, that are held against the first
@@ -66,13 +68,9 @@ def changed_share(seen: DepthMap, now: DepthMap, T_now_seen: Float) -> float:
 
     T_now_seen : (4, 4).
     """
-    fx, fy, cx, cy = now.intrinsics
-    h, w = now.shape
     p = transform_points(T_now_seen, seen.sample)
-    p = p[p[:, 2] > 0.05]
-    u, v = np.rint(p[:, 0] / p[:, 2] * fx + cx).astype(int), np.rint(p[:, 1] / p[:, 2] * fy + cy).astype(int)
-    inside = (u >= 0) & (v >= 0) & (u < w) & (v < h)
-    p, there = p[inside], now.surface[v[inside] * w + u[inside]].astype(np.float64)
+    pixel, inside, _ = pixels_of(now, p)
+    p, there = p[inside], now.surface[pixel].astype(np.float64)
     off_m = np.abs(np.einsum("ij,ij->i", p - there[:, :3], there[:, 3:]))
     both = np.isfinite(off_m)
     if both.sum() < FEW:
@@ -82,7 +80,8 @@ def changed_share(seen: DepthMap, now: DepthMap, T_now_seen: Float) -> float:
 
 def changed_picture_share(stream: ThermalStream, before_s: float, after_s: float) -> float:
     """Share of the thermal picture that differs between the frames nearest to two times, their offset removed."""
-    a, b = (stream.load(int(np.argmin(np.abs(stream.times_s - t)))).astype(np.float32) for t in (before_s, after_s))
+    nearest, _ = nearest_in_time(np.array([before_s, after_s]), stream.times_s)
+    a, b = (stream.load(int(frame)).astype(np.float32) for frame in nearest)
     window = (BLUR_PX, BLUR_PX)
     smooth, later = cv2.blur(a, window), cv2.blur(b, window)
     low, high = np.nanpercentile(smooth, (2, 98))
