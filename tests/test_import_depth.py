@@ -12,6 +12,7 @@ from support import foreign
 from support.foreign import GL, POSES, TIMES, Moments, plain, put
 
 from thermofusion.errors import QualityError, RecipeError, ScanError
+from thermofusion.geometry.rigid import rotation_angle_deg
 from thermofusion.scans import FORMATS, Stated, open_scan
 from thermofusion.scans.native.write import write_scan
 from thermofusion.scans.overlay import looks_mirrored
@@ -226,9 +227,9 @@ def _same_motion(got, T, frames):
 
 def test_right_poses_are_believed_as_they_are(torso, shared_data):
     for scan in (torso, open_scan(shared_data("redkitchen")), open_scan(shared_data("apc-shelf"))):
-        trajectory, messages = believed(scan)
+        trajectory, faults = believed(scan)
         assert trajectory is scan.trajectory
-        assert messages == ()
+        assert faults == ()
 
 
 def _w_first(T):
@@ -247,20 +248,22 @@ def _in_mm(T):
 
 
 @pytest.mark.parametrize(
-    ("misread", "name"),
+    ("misread", "name", "size"),
     [
-        (np.linalg.inv, "world-to-camera"),
-        (lambda T: T @ GL, "OpenGL's axes"),
-        (_w_first, "quaternions w first"),
-        (_in_mm, "millimetres"),
-        (lambda T: _w_first(np.linalg.inv(T)), "world-to-camera, quaternions w first"),
+        (np.linalg.inv, "world-to-camera", None),
+        (lambda T: T @ GL, "OpenGL's axes", (180, "deg")),
+        (_w_first, "quaternions w first", None),
+        (_in_mm, "millimetres", (1000, "times")),
+        (lambda T: _w_first(np.linalg.inv(T)), "world-to-camera, quaternions w first", None),
     ],
 )
-def test_other_readings_of_poses_are_recognised(torso, misread, name):
+def test_other_readings_of_poses_are_recognised(torso, misread, name, size):
     T = torso.trajectory.T_world_depth
     wrong = replace(torso, trajectory=Trajectory(torso.trajectory.times_s, misread(T)))
-    got, messages = believed(wrong)
-    assert f"read as {name}" in messages[0]
+    got, (fault,) = believed(wrong)
+    assert fault.done.startswith(f"read as {name}")
+    if size is not None:
+        assert (pytest.approx(fault.size, rel=1e-6), fault.unit) == size
     _same_motion(got, T, np.arange(len(T)))
 
 
@@ -268,11 +271,15 @@ def test_other_readings_of_poses_are_recognised(torso, misread, name):
 def test_lost_lines_are_found_where_they_are(torso, lost):
     t, T = torso.trajectory.times_s, torso.trajectory.T_world_depth
     wrong = replace(torso, trajectory=Trajectory(t[: -len(lost)], np.delete(T, lost, axis=0)))
-    got, messages = believed(wrong)
+    got, faults = believed(wrong)
     left = np.delete(np.arange(len(T)), lost)
     np.testing.assert_allclose(got.times_s, t[left])
     _same_motion(got, T, left)
-    assert len(messages) == (2 if lost == [40, 120] else 1)
+    sizes = [1, 1] if lost == [40, 120] else [len(lost)]
+    assert [(f.what, f.size) for f in faults] == [("lines of recorded poses missing", n) for n in sizes]
+    turn_deg = rotation_angle_deg(np.linalg.inv(T[: -len(lost)]) @ T[len(lost) :])[lost[0] :]
+    told = float(faults[0].evidence.split("off, ")[1].split("°")[0])
+    assert told == pytest.approx(np.median(turn_deg) / len(sizes), rel=0.2)
 
 
 def test_lost_depth_frames_are_no_lost_lines(torso):
@@ -282,12 +289,12 @@ def test_lost_depth_frames_are_no_lost_lines(torso):
     parts = {k: getattr(depth, k)[kept] for k in ("times_s", "index", "usable")}
     places = tuple(depth.places[i] for i in kept)
     fewer = replace(torso, depth=replace(depth, **parts, places=places, load=lambda i: depth.load(int(kept[i]))))
-    got, messages = believed(fewer)
-    assert not messages
+    got, faults = believed(fewer)
+    assert not faults
     np.testing.assert_array_equal(got.T_world_depth, torso.trajectory.T_world_depth)
     t, T = torso.trajectory.times_s, torso.trajectory.T_world_depth
-    got, messages = believed(replace(fewer, trajectory=Trajectory(t[:-1], np.delete(T, 100, axis=0))))
-    assert len(messages) == 1
+    got, faults = believed(replace(fewer, trajectory=Trajectory(t[:-1], np.delete(T, 100, axis=0))))
+    assert len(faults) == 1
 
 
 def test_poses_of_something_else_are_refused_by_name(torso):

@@ -1,6 +1,7 @@
 """What the data say against the model: named faults, their size, what was done, and what a user can do."""
 
-from .diagnose import VOCABULARY, diagnose
-from .words import Diagnosis
+from .diagnose import diagnose
+from .poses import of_poses
+from .words import VOCABULARY, Diagnosis
 
-__all__ = ["VOCABULARY", "Diagnosis", "diagnose"]
+__all__ = ["VOCABULARY", "Diagnosis", "diagnose", "of_poses"]

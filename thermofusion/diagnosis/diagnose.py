@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import MappingProxyType
 
 import numpy as np
 
@@ -13,29 +12,10 @@ from ..temperature.sensor.pattern import Pattern
 from ..temperature.solve import Temperature
 from ..types import VertexFlag
 from .radiation import of_lens, of_room
-from .words import Diagnosis
+from .words import VOCABULARY, Diagnosis
 
 OUTLINE_PX = 0.4  # clean scans leave 0.15-0.3 px between the outlines of model and image
 GRID = 24  # points along each side of the image at which a pattern's size is taken
-
-# What a diagnosis may be called, and what a user can do about it.
-VOCABULARY = MappingProxyType(
-    {
-        "pattern drifts between shutters": "let the camera warm up for 20 minutes, force a shutter every few "
-        "seconds, and keep the subject in the middle of the image",
-        "fixed pattern": "let the camera make a two-point correction before a black surface, and clean its window",
-        "readings agree by place in the image": "record more views in which the same skin crosses the whole image",
-        "reflected temperature stated wrong": "measure it with crumpled foil where the person stood, or leave it out",
-        "lens scatters light": "clean the lens, and keep hot things out of the picture's surroundings",
-        "lens scatters other than stated": "clean the lens, and measure it again with `thermal scatter`",
-        "surface that is not skin": "take off what can be taken off; its temperature is not the skin's",
-        "dead pixels": "have the camera's list of bad pixels renewed",
-        "depth scale is off": "measure something of known size with the depth camera, and the spacing of the cameras",
-        "time stamps jitter": "let camera or software stamp each thermal frame when it is taken, not when it is stored",
-        "outlines do not fit": "check the thermal clock, the rig and that nobody moved; repeat the scan more slowly",
-        "references contradict each other": "let references and camera warm up, and show them in more frames",
-    }
-)
 
 
 def diagnose(mapped: Mapped, temperature: Temperature, image_px: tuple[int, int]) -> tuple[Diagnosis, ...]:

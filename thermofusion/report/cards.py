@@ -101,7 +101,9 @@ def _diagnosis(report: dict[str, Any]) -> str:
     """What the data say against the model: one sentence each, its evidence unfolds."""
     items = []
     for found in report.get("diagnosis") or []:
-        size = f" ({found['size_K']:.2f} K)" if _number(found.get("size_K")) else ""
+        sizes = [f"{found['size']:.3g} {found.get('unit', '')}"] if _number(found.get("size")) else []
+        sizes += [f"{found['size_K']:.2f} K"] if _number(found.get("size_K")) else []
+        size = f" ({', '.join(sizes)})" if sizes else ""
         sentence = f"{found.get('what', '')}{size}, {found.get('where', '')}: {found.get('done', '')}"
         facts = "".join(f"<p><bdi>{escape(str(found[k]))}</bdi></p>" for k in ("evidence", "advice") if found.get(k))
         items.append(f"<li><details><summary><bdi>{escape(sentence)}</bdi></summary>{facts}</details></li>")

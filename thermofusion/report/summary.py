@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..diagnosis import Diagnosis, diagnose
+from ..diagnosis import Diagnosis, diagnose, of_poses
 from ..errors import counted
 from ..export.palettes import beyond_range
 from ..geometry.rigid import invert, rotation_angle_deg
@@ -305,11 +305,12 @@ def _temperature(t: Temperature) -> dict[str, Any]:
 
 
 def _diagnosis(scan: Scan, steps: Steps) -> tuple[Diagnosis, ...] | None:
-    """What the data say against the model; None where no temperature was solved for."""
+    """What the data say against the model, poses first; None where no temperature was solved for and poses fit."""
+    poses = of_poses(steps.tracking.faults)
     if steps.mapped is None or steps.temperature is None or scan.thermal is None:
-        return None
+        return poses or None
     lens = scan.thermal.camera.lens
-    return diagnose(steps.mapped, steps.temperature, (lens.width_px, lens.height_px))
+    return (*poses, *diagnose(steps.mapped, steps.temperature, (lens.width_px, lens.height_px)))
 
 
 def _too_large(recipe: Recipe, diagnosis: Sequence[Diagnosis]) -> list[str]:

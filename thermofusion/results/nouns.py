@@ -88,6 +88,7 @@ def stored() -> MappingProxyType[str, type]:
     from ..temperature.sensor.field import ImageField
     from ..temperature.sensor.pattern import Pattern
     from ..temperature.solve import Temperature
+    from ..tracking.faults import PoseFault
     from ..tracking.track import LostRange, TrackingResult
 
     return MappingProxyType(
@@ -106,6 +107,7 @@ def stored() -> MappingProxyType[str, type]:
             "mapped/2": Mapped,  # without `unsettled`
             "mapped/1": Mapped,  # without `background`
             "motion/1": MotionResult,
+            "pose-fault/1": PoseFault,
             "rig/2": RigResult,
             "rig/1": RigResult,  # without `free`, `frame_dt_s`, `depth_scale`
             "room-map/1": RoomMap,
@@ -114,7 +116,8 @@ def stored() -> MappingProxyType[str, type]:
             "temperature/3": Temperature,  # without `inputs`
             "temperature/2": Temperature,  # without `room`
             "temperature/1": Temperature,  # without `shared`
-            "tracking/1": TrackingResult,
+            "tracking/2": TrackingResult,
+            "tracking/1": TrackingResult,  # without `faults`
         }
     )
 

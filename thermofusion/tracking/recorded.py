@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..depth.filter import read_ahead
-from ..errors import QualityError, counted
+from ..errors import QualityError
 from ..files.tum import poses_of, rows_of
 from ..geometry.rigid import interpolate_trajectory, invert, rotation_angle_deg, transform_points
 from ..types import Camera, Float, Float32, Scan, Trajectory
+from .faults import PoseFault, loose, misread, shifted
 
 PAIR_S = 0.5  # between the frames of a pair: enough motion to tell readings apart, still much seen in common
 MAX_PAIRS = 240  # of a recording; two minutes without a gap, then evenly spread
@@ -84,8 +85,8 @@ def _readings() -> tuple[Reading, ...]:
 _READINGS = _readings()
 
 
-def believed(scan: Scan) -> tuple[Trajectory, tuple[str, ...]]:
-    """The scan's trajectory as it is to be read, and what had to be changed; the very object where nothing had.
+def believed(scan: Scan) -> tuple[Trajectory, tuple[PoseFault, ...]]:
+    """The scan's trajectory as it is to be read, and what was wrong with it; the very object where nothing was.
 
     Raises QualityError if the depth frames do not lie on each other by any reading.
     """
@@ -97,14 +98,13 @@ def believed(scan: Scan) -> tuple[Trajectory, tuple[str, ...]]:
     if np.isfinite(misfit).sum() < MIN_LATER:
         return scan.trajectory, ()  # views too far apart to be held against each other
     trajectory, typical = scan.trajectory, float(np.nanmedian(misfit))
-    messages: list[str] = []
+    faults: list[PoseFault] = []
     if typical > SUSPECT_MM:
         reading, left = _best_reading(trajectory, pairs)
         if left < min(CLEARLY * typical, GOOD_MM):
-            trajectory = replace(trajectory, T_world_depth=reading.of(trajectory.T_world_depth))
-            misfit = pairs.misfit_mm(trajectory)
-            text = f"the recorded poses are read as {reading.name}: neighbouring depth frames then miss each other"
-            messages.append(f"{text} by {left:.0f} mm, as they stand by {typical:.0f} mm")
+            read = replace(trajectory, T_world_depth=reading.of(trajectory.T_world_depth))
+            faults.append(misread(reading.name, trajectory, read, (typical, left)))
+            trajectory, misfit = read, pairs.misfit_mm(read)
         elif typical > BAD_MM:
             raise QualityError(
                 f"the recorded poses do not fit the depth: neighbouring frames miss each other by {typical:.0f} mm "
@@ -113,9 +113,9 @@ def believed(scan: Scan) -> tuple[Trajectory, tuple[str, ...]]:
                 hint="set tracking.source to estimate, or mend the poses: T_world_depth in metres, qx qy qz qw",
             )
         elif typical > GOOD_MM:
-            messages.append(f"the recorded poses leave {typical:.0f} mm between depth frames: consider tracking.refine")
+            faults.append(loose(typical, "all recorded poses"))
     trajectory, more = _lost_lines(scan, trajectory, pairs, misfit)
-    return trajectory, (*messages, *more)
+    return trajectory, (*faults, *more)
 
 
 def _best_reading(recorded: Trajectory, pairs: _Pairs) -> tuple[Reading, float]:
@@ -126,29 +126,34 @@ def _best_reading(recorded: Trajectory, pairs: _Pairs) -> tuple[Reading, float]:
     return _READINGS[best], left[best]
 
 
-def _lost_lines(scan: Scan, trajectory: Trajectory, pairs: _Pairs, misfit: Float) -> tuple[Trajectory, tuple[str, ...]]:
+def _lost_lines(
+    scan: Scan, trajectory: Trajectory, pairs: _Pairs, misfit: Float
+) -> tuple[Trajectory, tuple[PoseFault, ...]]:
     """The trajectory with later poses moved to their frames where lines are missing, or stand twice."""
-    messages: list[str] = []
-    while len(messages) < MAX_BREAKS and _one_by_one(scan, trajectory):
+    faults: list[PoseFault] = []
+    while len(faults) < MAX_BREAKS and _one_by_one(scan, trajectory):
         found = _break(scan, trajectory, pairs, misfit)
         if found is None:
             break
         at, shift = found
-        trajectory = _shifted(scan, trajectory, at, shift)
-        misfit = pairs.misfit_mm(trajectory)
-        lines = f"{counted(abs(shift), 'line')} of the recorded poses"
-        what = "missing" if shift > 0 else "too many"
-        messages.append(f"{lines} {what} at depth frame {int(scan.depth.index[at])}: later poses moved to their frames")
+        moved = _shifted(scan, trajectory, at, shift)
+        before, misfit = misfit, pairs.misfit_mm(moved)
+        worst = int(np.nanargmax(before - misfit))
+        left = float(before[worst]), float(misfit[worst])
+        faults.append(shifted(trajectory, moved, shift, int(scan.depth.index[at]), left))
+        trajectory = moved
     bad = np.flatnonzero(misfit > BAD_MM)
     if len(bad):
         at_frames = ", ".join(str(int(scan.depth.index[pairs.frames[k]])) for k in bad[:5])
-        text = f"the recorded poses do not fit the depth at frames {at_frames}{' and more' * (len(bad) > 5)}"
+        where = f"at frames {at_frames}{' and more' * (len(bad) > 5)}"
         if len(bad) > BAD_SHARE * np.isfinite(misfit).sum():
             raise QualityError(
-                text, place=scan.root, hint="set tracking.source to estimate, or tracking.refine to true"
+                f"the recorded poses do not fit the depth {where}",
+                place=scan.root,
+                hint="set tracking.source to estimate, or tracking.refine to true",
             )
-        messages.append(text)
-    return trajectory, tuple(messages)
+        faults.append(loose(float(np.median(misfit[bad])), where))
+    return trajectory, tuple(faults)
 
 
 def _break(scan: Scan, trajectory: Trajectory, pairs: _Pairs, misfit: Float) -> tuple[int, int] | None:

@@ -23,6 +23,7 @@ from ..progress import Progress, silent
 from ..recipe import InputSection, SubjectSection, TrackingSection
 from ..types import Bool, Float, Scan, Trajectory, brief
 from .ahead import Ahead
+from .faults import PoseFault, refined
 from .fragments import Fragment
 from .frames import TrackingFrames
 from .joint import LOOP_APART, overlapping, solve_jointly
@@ -59,7 +60,7 @@ class TrackingResult:
     tracked : (N,) of the depth stream. fitness : (N,) share of a frame's visible points that found a partner;
     residual_mm : (N,) their median distance at 1 m; NaN where not tracked. lost : every break. loop_closures : pairs of
     fragments far apart in time that were tied. converged : of the joint solution. floor_plane : (4,) [n, d] in the
-    world, n·p + d = height in m, or None. source : `recorded`, `estimated` or `refined`.
+    world, n·p + d = height in m, or None. source : `recorded`, `estimated` or `refined`. faults : of recorded poses.
     """
 
     trajectory: Trajectory
@@ -72,6 +73,7 @@ class TrackingResult:
     floor_plane: Float | None
     source: str
     messages: tuple[str, ...]
+    faults: tuple[PoseFault, ...] = ()
 
     __repr__ = brief
 
@@ -98,21 +100,21 @@ def locate(
     if scan.trajectory is None or tracking.source == "estimate":
         scan = replace(scan, trajectory=None)
         return track(scan, input=input, subject=subject, tracking=tracking, depth=depth, ahead=ahead, progress=progress)
-    trajectory, messages = believed(scan)
+    trajectory, faults = believed(scan)
     scan = replace(scan, trajectory=trajectory)
     if not tracking.refine:
-        return recorded(scan, messages)
+        return replace(recorded(scan), faults=faults)
     result = track(scan, input=input, subject=subject, tracking=tracking, depth=depth, progress=progress)
-    return replace(result, messages=(*messages, *result.messages))
+    return replace(result, faults=refined(faults))
 
 
-def recorded(scan: Scan, messages: tuple[str, ...] = ()) -> TrackingResult:
+def recorded(scan: Scan) -> TrackingResult:
     """The recorded trajectory as it is. Depth frames outside it count as not tracked."""
     assert scan.trajectory is not None
     n = len(scan.depth)
     _, inside = interpolate_trajectory(scan.trajectory, scan.depth.times_s)
     nan = np.full(n, np.nan)
-    return TrackingResult(scan.trajectory, inside, nan, nan, (), 0, True, None, "recorded", messages)
+    return TrackingResult(scan.trajectory, inside, nan, nan, (), 0, True, None, "recorded", ())
 
 
 def track(
