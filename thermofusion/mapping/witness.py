@@ -77,6 +77,7 @@ class DepthWitness:
         v, u = np.mgrid[: depth.height_px // STEP, : depth.width_px // STEP] * STEP + 0.5 * (STEP - 1)
         rays = pixel_rays(depth, u, v)
         self._rays = (rays / rays[..., 2:]).astype(np.float32)
+        self._no_ray = ~np.isfinite(self._rays[..., 0])
         self._hole = max(3, 2 * round(HOLE_PX * depth.width_px / STEP) + 1)
         self._hole_rad = STEP * (self._hole // 2) / depth.focal_px
         # a cell is no finer than the points are, so that near surfaces have no gaps
@@ -86,12 +87,7 @@ class DepthWitness:
         """What a view's moment shows; None where no depth frame is near in time."""
         if not self._known[view]:
             return None
-        z = np.nan_to_num(self._stream.load(int(self._frame[view])), nan=0.0)
-        h, w = self._rays.shape[:2]
-        cells = z[: h * STEP, : w * STEP].reshape(h, STEP, w, STEP)
-        near = np.asarray(np.where(cells > 0, cells, FAR_M).min(axis=(1, 3)), np.float32)
-        veil = cells.max(axis=(1, 3)) - near > JUMP_M_AT_1M * near**2
-        near[veil | ((cells > 0).sum(axis=(1, 3)) < LEAST_PIXELS) | ~np.isfinite(self._rays[..., 0])] = FAR_M
+        near, veil = self._nearest(self._stream.load(int(self._frame[view])))
         filled = cv2.erode(near, np.ones((self._hole, self._hole), np.uint8))
         filled = np.where((near == FAR_M) & ~veil, filled, FAR_M)
         T = self._T_thermal_depth[view]
@@ -100,6 +96,25 @@ class DepthWitness:
         holes = self._buffer(np.asarray(filled, np.float32), T)
         beside, filled = (np.asarray(cv2.erode(b, around), np.float32) for b in (measured, holes))
         return Depths(measured, beside, filled, self._cell_px, self._lens.focal_px, self._own_m, self._hole_rad)
+
+    def _nearest(self, depth_m: Float32) -> tuple[Float32, Bool]:
+        """Of each step's pixels, depth_m (H, W), the nearest (h, w) m, FAR_M = none; and which lie across two surfaces.
+
+        The pixels of a step side by side as whole images: reductions over axes of two take ten times as long.
+        """
+        h, w = self._rays.shape[:2]
+        z = np.nan_to_num(depth_m[: h * STEP, : w * STEP], nan=0.0)
+        parts = [z[r::STEP, c::STEP] for r in range(STEP) for c in range(STEP)]
+        near, far = np.full((h, w), FAR_M), np.zeros((h, w), np.float32)
+        count = np.zeros((h, w), np.uint8)
+        for part in parts:
+            valid = part > 0
+            np.minimum(near, part, out=near, where=valid)
+            np.maximum(far, part, out=far)
+            count += valid
+        veil = far - near > JUMP_M_AT_1M * near**2
+        near[veil | (count < LEAST_PIXELS) | self._no_ray] = FAR_M
+        return near, veil
 
     def _buffer(self, z: Float32, T_thermal_depth: Float) -> Float32:
         """Nearest depth in each cell of the thermal image, of z (h, w) of the depth camera."""
