@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import sys
-from typing import Any
+import threading
+from contextlib import suppress
+from typing import Any, NoReturn
 
 from .errors import INTERRUPTED, INTERRUPTED_SENTENCE
 
@@ -29,12 +32,27 @@ def main() -> None:
         from .cli import main as run
 
         run()
-    except SystemExit:
-        raise
+    except SystemExit as e:
+        _leave(e)
     except BaseException:  # half-imported libraries turn an interrupt into errors of their own
         if asked:
             _end()
         raise
+
+
+def _leave(how: SystemExit) -> NoReturn:
+    """Exit as Python does, but the libraries are not taken apart first: the system takes back memory faster."""
+    if not isinstance(how.code, int):
+        raise how
+    with suppress(AttributeError):  # both stand for what Python does at its end; neither is promised
+        threading._shutdown()  # type: ignore[attr-defined]
+        atexit._run_exitfuncs()
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError, ValueError):
+                if stream is not None:
+                    stream.flush()
+        os._exit(how.code & 0xFF)
+    raise how
 
 
 def _end() -> None:
