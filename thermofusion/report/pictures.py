@@ -13,6 +13,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
+from weakref import WeakKeyDictionary
 
 import cv2
 import numpy as np
@@ -39,6 +40,7 @@ INSIDE_RGB = ((112, 112, 112), (84, 84, 84))  # and to the right: no palette can
 OUTLINE_RGB, OUTLINE_ALPHA = (40, 40, 44), 0.75  # sRGB and opacity of the line round contours
 CREASE_PX = 10.0  # a step in depth of this many pixels is an edge: a slope of 84° is none
 _LABELS = {"left": "left side", "right": "right side"}
+_OUTLINES: WeakKeyDictionary[Cast, Float32] = WeakKeyDictionary()  # go with their views
 _SIDES = {"front": ("R", "L"), "back": ("L", "R")}  # of the subject, at the picture's left and right
 
 
@@ -259,16 +261,21 @@ def paint(cast: Cast, values: NDArray, scale: Scale) -> UInt8:
     value, inside = cast.interpolate(values), cast.facing < 0
     skin = ~inside & ~np.isnan(value)
     share = {"skin": cast.per_pixel(skin), "bare": cast.per_pixel(~inside & ~skin), "inside": cast.per_pixel(inside)}
-    mean = cast.per_pixel(np.where(skin, value, 0)) / np.maximum(share["skin"], 1e-6)
-    rgb = palettes.apply(mean, scale.palette, scale.lo, scale.hi) * share["skin"][..., None]
+    total, line = cast.per_pixel(np.where(skin, value, 0)), _outline(cast)
+    # most of a picture is background, and stays white
+    at = np.flatnonzero((share["skin"] + share["bare"] + share["inside"] + line).ravel())
+    share = {k: s.ravel()[at] for k, s in share.items()}
+    some = np.maximum(share["skin"], 1e-6)
+    rgb = palettes.apply(total.ravel()[at] / some, scale.palette, scale.lo, scale.hi) * share["skin"][:, None]
     if scale.shading > 0:
         lit = cast.per_pixel(np.where(skin, 1 - scale.shading * (1 - cast.facing), 0))
-        rgb *= (lit / np.maximum(share["skin"], 1e-6))[..., None]
-    rgb += share["bare"][..., None] * _hatch(cast.shape)
-    rgb += share["inside"][..., None] * _hatch(cast.shape, inside=True)
-    rgb += (1 - share["skin"] - share["bare"] - share["inside"])[..., None] * np.float32(255)
-    line = _outline(cast)[..., None]
-    painted: UInt8 = np.round(np.clip(rgb * (1 - line) + line * np.array(OUTLINE_RGB), 0, 255)).astype(np.uint8)
+        rgb *= (lit.ravel()[at] / some)[:, None]
+    for kind in ("bare", "inside"):
+        if share[kind].any():
+            rgb += share[kind][:, None] * _hatch(cast.shape, inside=kind == "inside").reshape(-1, 3)[at]
+    rgb += (1 - share["skin"] - share["bare"] - share["inside"])[:, None] * np.float32(255)
+    painted = np.full((*cast.shape, 3), 255, np.uint8)
+    painted.reshape(-1, 3)[at] = _lined(rgb, line.reshape(-1, 1)[at])
     return painted
 
 
@@ -283,14 +290,25 @@ def _paint_shape(cast: Cast, surface: SurfaceMesh) -> UInt8:
     share, line = [cast.per_pixel(~inside)[..., None], cast.per_pixel(inside)[..., None]], _outline(cast)[..., None]
     page = np.stack([cast.per_pixel(rgb[:, c] * lit) for c in range(3)], axis=-1)
     page += share[1] * _hatch(cast.shape, inside=True) + (1 - share[0] - share[1]) * np.float32(255)
-    painted: UInt8 = np.round(np.clip(page * (1 - line) + line * np.array(OUTLINE_RGB), 0, 255)).astype(np.uint8)
-    return painted
+    return _lined(page, line)
+
+
+def _lined(rgb: NDArray, line: Float32) -> UInt8:
+    """Colours (..., 3) under a line of opacity (..., 1)."""
+    return np.asarray(np.round(np.clip(rgb * (1 - line) + line * np.array(OUTLINE_RGB), 0, 255)), np.uint8)
 
 
 def _outline(cast: Cast) -> Float32:
     """(H, W) opacity of the line round contours: on rays whose neighbour's surface stands well before theirs, so that
-    the nearer side stays untouched.
+    the nearer side stays untouched. Found once for all maps of a view.
     """
+    found = _OUTLINES.get(cast)
+    if found is None:
+        found = _OUTLINES[cast] = _found_outline(cast)
+    return found
+
+
+def _found_outline(cast: Cast) -> Float32:
     depth = np.minimum(cast.distance_m, np.float32(1e6))  # the background is far, not infinitely
     step, line = np.float32(CREASE_PX / cast.px_per_m), np.zeros(depth.shape, bool)
     down, right = depth[1:] - depth[:-1], depth[:, 1:] - depth[:, :-1]
