@@ -54,11 +54,14 @@ def walk(duration_s: float = 8.0, tremor: float = 1.0) -> Trajectory:
 
 
 def render(mesh: SurfaceMesh, T_world_thermal: np.ndarray, seed: int) -> np.ndarray:
-    """What the camera reports, °C: 2 x 2 rays a pixel, emissivity falling at the limb, point spread, noise, offset."""
+    """What the camera reports, °C: 2 x 2 rays a pixel, emissivity falling at the limb, point spread, noise, offset.
+
+    T_world_thermal : (4, 4), or (480, 4, 4) of rows of rays that are taken one after another.
+    """
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(o3d.core.Tensor(mesh.vertices_m), o3d.core.Tensor(mesh.triangles.astype(np.uint32)))
-    rays = FINE_RAYS @ T_world_thermal[:3, :3].T
-    eye = np.broadcast_to(T_world_thermal[:3, 3], rays.shape)
+    rays = FINE_RAYS @ np.swapaxes(T_world_thermal[..., :3, :3], -1, -2)
+    eye = np.broadcast_to(T_world_thermal[..., None, :3, 3], rays.shape)
     answer = scene.cast_rays(o3d.core.Tensor(np.concatenate([eye, rays], -1).astype(np.float32)))
     t = answer["t_hit"].numpy()
     hit = np.isfinite(t)
@@ -72,14 +75,23 @@ def render(mesh: SurfaceMesh, T_world_thermal: np.ndarray, seed: int) -> np.ndar
     return (cv2.GaussianBlur(image, (0, 0), 0.8) + noise + 0.5 * np.sin(seed)).astype(np.float32)
 
 
-def make_scan(mesh: SurfaceMesh, trajectory: Trajectory, *, sway: np.ndarray | None = None) -> Scan:
-    """24 thermal frames. sway : (24, 6) twist in the world frame by which the body has moved in each, or None."""
+def make_scan(
+    mesh: SurfaceMesh, trajectory: Trajectory, *, sway: np.ndarray | None = None, readout_s: float = 0.0
+) -> Scan:
+    """24 thermal frames. sway : (24, 6) twist in the world frame by which the body has moved in each, or None.
+
+    readout_s : from the first row to the last, about the frame's time.
+    """
     taken = np.linspace(0.3, trajectory.times_s[-1] - 0.3, 24)
     T_world_depth, _ = interpolate_trajectory(trajectory, taken)
     # A body moved by D looks as it does at rest to a camera moved by its inverse.
     T_world_thermal = (
         invert(se3_exp(np.zeros((24, 6)) if sway is None else sway)) @ T_world_depth @ invert(T_THERMAL_DEPTH)
     )
+    if readout_s:
+        rows_s = readout_s * ((np.arange(480) + 0.5) / 480 - 0.5)
+        T_rows, _ = interpolate_trajectory(trajectory, (taken[:, None] + rows_s).ravel())
+        T_world_thermal = (T_rows @ invert(T_THERMAL_DEPTH)).reshape(24, 480, 4, 4)
     images = [render(mesh, T, i) for i, T in enumerate(T_world_thermal)]
     places, index = tuple(f"thermal {i}" for i in range(24)), np.arange(24)
     camera = ThermalCamera(THERMAL, T_THERMAL_DEPTH, netd_K=NETD_K)

@@ -57,6 +57,13 @@ def _outlines(m: Mapped) -> list[Diagnosis]:
         found.append(
             Diagnosis("time stamps jitter", text, None, "thermal frames", done, size=1e3 * m.jitter_s, unit="ms")
         )
+    if m.readout is not None:
+        ms, sigma_ms = 1e3 * abs(m.readout.readout_s), 1e3 * m.readout.sigma_s
+        order = "first to last" if m.readout.readout_s > 0 else "last to first"
+        text = f"outlines lean with their motion as if rows were read from the {order} in {ms:.0f} ± {sigma_ms:.0f} ms"
+        done = f"left as it is: it moves outlines by {m.readout.shift_px:.2f} px, and sigma contains what outlines miss"
+        what = "rows are read one after another"
+        found.append(Diagnosis(what, text, None, "while the camera moves", done, size=ms, unit="ms"))
     if m.depth_scale:
         side = "far" if m.depth_scale > 0 else "near"
         percent = 100 * abs(m.depth_scale)

@@ -25,6 +25,7 @@ from ..physics.signal import SignalConverter
 from ..progress import Progress, silent
 from ..recipe import InputSection, MappingSection
 from ..rig.align import RigResult
+from ..rig.rows import ReadOut
 from ..types import (
     Bool,
     Camera,
@@ -121,6 +122,7 @@ class Mapped:
     background : what the views show of the room; None in results of earlier versions. scatter : of the lens, taken off
     where its share is not 0; spread : (V,) what one whole share of it would do to each vertex, W m-2 sr-1.
     unsettled : (V,) vertices whose motion was not followed; (0,) for a subject that stood still.
+    readout : the time that reading an image's rows takes, as outlines tell it; None = no news.
     """
 
     views: ThermalViews
@@ -136,6 +138,7 @@ class Mapped:
     unsettled: Bool = field(default_factory=lambda: np.zeros(0, bool))
     scatter: LensScatter | None = None
     spread: Float32 | None = None
+    readout: ReadOut | None = None
 
     __repr__ = brief
 
@@ -197,7 +200,8 @@ def observe(
     spread = spread_on(stream, views, converter, observations, len(surface))
     left = rig.residual_px_after, rig.jitter_s, rig.depth_scale
     unsettled = np.zeros(0, bool) if body is None else body.unsettled
-    return Mapped(views, left_out, observations, blackbodies, motion, uv, *left, background, unsettled, scatter, spread)
+    last = unsettled, scatter, spread, rig.readout
+    return Mapped(views, left_out, observations, blackbodies, motion, uv, *left, background, *last)
 
 
 def observe_views(

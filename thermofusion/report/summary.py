@@ -241,6 +241,7 @@ def _rig(scan: Scan, a: RigResult) -> dict[str, Any]:
         "sigma_translation_mm": a.sigma_translation_mm,
         "sigma_time_s": a.sigma_time_s,
         "jitter_s": a.jitter_s,
+        "readout_s": None if a.readout is None else a.readout.readout_s,
         "views_used": a.views_used,
     }
 

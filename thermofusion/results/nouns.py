@@ -83,6 +83,7 @@ def stored() -> MappingProxyType[str, type]:
     from ..mapping.references import BlackbodyReading
     from ..rig.align import RigResult
     from ..rig.free.place import FreeViews
+    from ..rig.rows import ReadOut
     from ..temperature.crosscal import Calibration
     from ..temperature.room.map import RoomMap
     from ..temperature.sensor.field import ImageField
@@ -102,13 +103,16 @@ def stored() -> MappingProxyType[str, type]:
             "free-views/1": FreeViews,
             "image-field/1": ImageField,
             "lost-range/1": LostRange,
-            "mapped/4": Mapped,
+            "mapped/5": Mapped,
+            "mapped/4": Mapped,  # without `readout`
             "mapped/3": Mapped,  # without `scatter`
             "mapped/2": Mapped,  # without `unsettled`
             "mapped/1": Mapped,  # without `background`
             "motion/1": MotionResult,
             "pose-fault/1": PoseFault,
-            "rig/2": RigResult,
+            "read-out/1": ReadOut,
+            "rig/3": RigResult,
+            "rig/2": RigResult,  # without `readout`
             "rig/1": RigResult,  # without `free`, `frame_dt_s`, `depth_scale`
             "room-map/1": RoomMap,
             "sensor-pattern/1": Pattern,

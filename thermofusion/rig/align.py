@@ -49,6 +49,7 @@ from .estimate import (
 from .free.place import FreeViews, place_views
 from .jitter import frame_times
 from .outlines import read_outlines, search_shift
+from .rows import ReadOut, readout_time
 
 BodyAt = Callable[[Float], Standing]  # times, s -> the subject as it stood then
 MAX_VIEWS = 30  # that enter: more cost time and say nothing new
@@ -75,6 +76,7 @@ class RigResult:
     frame_dt_s : (F,) what the times of single thermal frames lack, None = nothing; jitter_s : one sigma of it.
     depth_scale : depth over truth less 1, where outlines ask for it or for cameras that stand farther apart by this
     share, and for nothing else; 0 = no news.
+    readout : the time that reading an image's rows takes; None = no news.
     free : where each view of a camera that is not on the rig was taken; rig and clock then mean nothing.
     """
 
@@ -91,6 +93,7 @@ class RigResult:
     jitter_s: float = 0.0
     depth_scale: float = 0.0
     free: FreeViews | None = None
+    readout: ReadOut | None = None
 
     __repr__ = brief
 
@@ -161,6 +164,9 @@ def align(
     jitter = frame_times(measured, State.of(result.camera))
     if jitter is not None:
         result = _with_times(stream, body_at, measured, begin, input.max_pose_gap_ms / 1e3) or result
+    if result.frame_dt_s is not None:
+        measured = measured.later(result.frame_dt_s[frames[[v.row for v in outlines]]])
+    result = replace(result, readout=readout_time(measured, State.of(result.camera)))
     if begin is camera:
         return result
     if not result.converged:

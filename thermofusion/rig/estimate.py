@@ -68,6 +68,10 @@ class Measured:
     block: NDArray[np.intp]
     point: NDArray[np.intp]
 
+    def part(self, mask: NDArray) -> Measured:
+        """The points of a mask (n,)."""
+        return Measured(**{k: getattr(self, k)[mask] for k in self.__dataclass_fields__})
+
 
 @dataclass(frozen=True, eq=False)
 class OutlineSet:
@@ -101,6 +105,10 @@ class OutlineSet:
     def twists(self, state: State) -> Float:
         """(N, 6) the world's twist in the thermal frame per second: rad/s, m/s."""
         return self._poses(state)[1]
+
+    def poses(self, state: State) -> Float:
+        """(N, 4, 4) T_thermal_world of the views."""
+        return self._poses(state)[0]
 
     def residual_px(self, state: State) -> float:
         """Robust RMS residual over a fixed, wide reach, so that before and after compare; median (width) removed."""
