@@ -25,7 +25,7 @@ FIT_STEPS = 30  # of the robust weights: residuals of a moving edge have two hum
 MIN_SIGMAS = 5.0  # of its own error
 MIN_SHIFT_PX = 0.04  # rms over the outlines: clean scans stay below 0.02
 HALF_SIGMAS = 2.0  # by which s of each half of the views must stand out by itself
-MIN_OVER_ACROSS = 2.0  # its sigmas, over those of a shift across the velocity: errors of the model go either way
+MIN_OVER_ACROSS = 1.5  # its sigmas, over those of a shift across the velocity: errors of the model go either way
 
 
 @dataclass(frozen=True)
