@@ -121,8 +121,9 @@ def test_a_wrong_scale_of_depth_is_told_from_a_turned_rig(body, scan):
     assert aligned(turned(scan, [0.3, -0.3, 0.26]), body, walk()).depth_scale == 0
 
 
-def test_rows_that_are_read_one_after_another_are_told(body, scan, readout_s=-0.05):
-    """From the last to the first. This camera sees outlines move by some 20 px a second; taken all at once, rows say nothing."""
+def test_rows_that_are_read_one_after_another_are_told(body, scan):
+    """From the last to the first. Outlines move by some 20 px a second; taken all at once, rows say nothing."""
+    readout_s = -0.05
     found = aligned(make_scan(body, walk(), readout_s=readout_s), body, walk()).readout
     assert found.readout_s == pytest.approx(readout_s, rel=0.25)
     assert abs(found.readout_s - readout_s) < 3 * found.sigma_s
