@@ -200,8 +200,8 @@ def observe(
     spread = spread_on(stream, views, converter, observations, len(surface))
     left = rig.residual_px_after, rig.jitter_s, rig.depth_scale
     unsettled = np.zeros(0, bool) if body is None else body.unsettled
-    last = unsettled, scatter, spread, rig.readout
-    return Mapped(views, left_out, observations, blackbodies, motion, uv, *left, background, *last)
+    seen = Mapped(views, left_out, observations, blackbodies, motion, uv, *left, background, unsettled, scatter, spread)
+    return replace(seen, readout=rig.readout)
 
 
 def observe_views(
