@@ -15,7 +15,7 @@ from thermofusion.recipe import TemperatureSection
 from thermofusion.temperature import blend as blending
 from thermofusion.temperature import crosscal
 from thermofusion.temperature.blend import around, blend
-from thermofusion.temperature.problem import remove_air_path
+from thermofusion.temperature.room.changing import remove_air_path
 from thermofusion.temperature.room.stated import Room
 from thermofusion.temperature.uncertainty import (
     BILINEAR_VARIANCE,

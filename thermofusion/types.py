@@ -6,7 +6,7 @@ are x right, y down, z forward; the centre of the first pixel is (0, 0). NaN mea
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from enum import IntFlag
 from pathlib import Path
@@ -292,11 +292,47 @@ class Stream:
         return f"<{type(self).__name__} of {len(self)} frames over {span_s:.2f} s, {int(self.usable.sum())} usable>"
 
 
+@dataclass(frozen=True, eq=False)
+class FrameConditions:
+    """What was measured beside each frame of a thermal stream: (N,) float64 each, NaN = not stated for that frame.
+
+    The names are those of the columns of frames.csv. fpa_degC : of the sensor itself.
+    """
+
+    reflected_degC: Float
+    air_degC: Float
+    relative_humidity_pct: Float
+    fpa_degC: Float
+    lens_degC: Float
+
+    @classmethod
+    def of(cls, n: int, known: Mapping[str, NDArray]) -> FrameConditions | None:
+        """Of n frames, from the columns (n,) that are known; None where nothing is stated."""
+        if not any(np.isfinite(column).any() for column in known.values()):
+            return None
+        return cls(**{f.name: np.asarray(known.get(f.name, np.full(n, np.nan)), np.float64) for f in fields(cls)})
+
+    @property
+    def stated(self) -> dict[str, Float]:
+        """The columns (N,) that state anything, by name."""
+        return {name: column for name, column in vars(self).items() if np.isfinite(column).any()}
+
+    def take(self, rows: NDArray) -> FrameConditions:
+        """Of some frames, (M,) positions."""
+        return FrameConditions(**{name: column[rows] for name, column in vars(self).items()})
+
+    __repr__ = brief
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class ThermalStream(Stream):
-    """The thermal camera's images, and the camera that took them."""
+    """The thermal camera's images, and the camera that took them.
+
+    conditions : of each frame; None where the recording states them at most once for all.
+    """
 
     camera: ThermalCamera
+    conditions: FrameConditions | None = None
 
     @property
     def depth_times_s(self) -> Float:

@@ -160,6 +160,8 @@ def fingerprint(scan: Scan) -> str:
                 )
             except OSError:
                 h.update(place.encode("utf-8", "surrogateescape"))
+    if scan.thermal is not None and scan.thermal.conditions is not None:
+        h.update(_hash(scan.thermal.conditions.stated).encode())
     rest = {f.name: getattr(scan, f.name) for f in dataclasses.fields(scan) if f.name not in (*streams, "root")}
     rest["thermal camera"] = None if scan.thermal is None else scan.thermal.camera
     h.update(_hash(rest).encode())

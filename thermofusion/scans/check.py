@@ -355,12 +355,18 @@ def overlays(scan: Scan, count: int = OVERLAY_FRAMES) -> dict[str, UInt8]:
 
 def missing_metadata(scan: Scan) -> tuple[str, ...]:
     """What the recording does not state and a quantitative result should."""
-    e = scan.environment
+    e, told = scan.environment, () if scan.thermal is None else _told(scan.thermal)
     thermal, camera = scan.thermal is not None, None if scan.thermal is None else scan.thermal.camera
     entries = (
-        (thermal and e.reflected_degC is None, "environment.reflected_degC (temperature of the surroundings)"),
-        (thermal and e.air_degC is None, "environment.air_degC"),
-        (thermal and e.relative_humidity_pct is None, "environment.relative_humidity_pct"),
+        (
+            thermal and e.reflected_degC is None and "reflected_degC" not in told,
+            "environment.reflected_degC (temperature of the surroundings)",
+        ),
+        (thermal and e.air_degC is None and "air_degC" not in told, "environment.air_degC"),
+        (
+            thermal and e.relative_humidity_pct is None and "relative_humidity_pct" not in told,
+            "environment.relative_humidity_pct",
+        ),
         (thermal and not scan.references, "references (without one the level is relative, not absolute)"),
         (camera is not None and camera.psf_sigma_px is None, "cameras.thermal.psf_sigma_px"),
         (scan.recorded_at is None, "recorded_at"),
@@ -368,6 +374,11 @@ def missing_metadata(scan: Scan) -> tuple[str, ...]:
         ("acclimatisation_min" not in scan.subject, "subject.acclimatisation_min"),
     )
     return tuple(text for absent, text in entries if absent)
+
+
+def _told(stream: ThermalStream) -> tuple[str, ...]:
+    """What is stated of the frames, one by one."""
+    return () if stream.conditions is None else tuple(stream.conditions.stated)
 
 
 def _figures(stream: Stream, camera: Camera) -> StreamFigures:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..errors import ScanError
 from ..files.reading import MAX_PIXELS, claimed_size, decode_image, depth_from_raw, read_bytes
 from ..files.tum import MAX_TIME_S
-from ..types import Camera, Float, Rig, Stream, ThermalCamera, ThermalStream
+from ..types import Camera, Float, FrameConditions, Rig, Stream, ThermalCamera, ThermalStream
 
 Kind = Literal["depth", "color", "thermal"]
 FOCAL_LENGTHS = (0.05, 100.0)  # in image sizes: from 170° across to half a degree
@@ -176,9 +176,9 @@ def make_rig(depth: Camera, color: Camera | None = None, T_color_depth: NDArray 
         raise ScanError(str(e), place=place) from None
 
 
-def as_thermal(stream: Stream, camera: ThermalCamera) -> ThermalStream:
-    """A stream of thermal images with the camera that took them."""
-    return ThermalStream(stream.times_s, stream.load, stream.places, stream.index, stream.usable, camera)
+def as_thermal(stream: Stream, camera: ThermalCamera, conditions: FrameConditions | None = None) -> ThermalStream:
+    """A stream of thermal images with the camera that took them, and what was measured beside each."""
+    return ThermalStream(stream.times_s, stream.load, stream.places, stream.index, stream.usable, camera, conditions)
 
 
 # ---------------------------------------------------------------- poses

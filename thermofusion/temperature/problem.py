@@ -13,10 +13,10 @@ from ..geometry.mesh import edge_gradient
 from ..mapping.observe import Mapped, clear_of_silhouettes
 from ..physics.band import Band
 from ..physics.emissivity import EmissivityModel, model_from_recipe
-from ..physics.equation import leaving_radiance
 from ..recipe import MappingSection, TemperatureSection
 from ..types import Bool, Camera, Float, Float32, Int, LensScatter, Observations, Scan, SurfaceMesh, ThermalViews
 from .references import ContactReading, ExpectedReading, contact_readings, expected_readings
+from .room.changing import Changing
 from .room.harmonics import open_transfer
 from .room.map import RoomMap, RoomPrior
 from .room.operator import operator_effect, operator_excess, without_operator
@@ -41,7 +41,8 @@ class ThermalProblem:
     vertices_per_patch : vertices that share a normal's error. other : (V,) what is not skin, None = not asked.
     room_map : radiance of the room from each direction; None: even, as stated. transfer : (V, 9) how its harmonics
     light a vertex. uneven : (V,) what the room adds to what vertices reflect, beyond its mean. scatter : of the
-    lens. effects : (V,) what one sigma of it, or of who stands at the camera, does to readings of a vertex.
+    lens. effects : (V,) what one sigma of it, or of who stands at the camera, does to readings of a vertex. changing :
+    what differed from view to view; its room and air are off the observations.
     """
 
     vertices: NDArray[np.intp]
@@ -70,6 +71,7 @@ class ThermalProblem:
     uneven: Float | None = None
     scatter: LensScatter | None = None
     effects: Mapping[str, Float32] = field(default_factory=dict)
+    changing: Changing | None = None
 
     @classmethod
     def of(
@@ -87,16 +89,20 @@ class ThermalProblem:
         """
         assert scan.thermal is not None
         camera = scan.thermal.camera
-        band, room = Band(*camera.band_um), room_of(scan.environment, settings)
+        band = Band(*camera.band_um)
+        changing = Changing.of(scan, mapped.views, settings, band)
+        room = room_of(changing.environment, settings)
         L_room = float(band.radiance(room.reflected_K))
-        L_air = float(band.radiance(room.air_K or room.reflected_K))
-        rows = remove_air_path(mapped.observations, settings.transmission_per_m, L_air)
+        air_K = room.air_K or room.reflected_K
+        rows = changing.without_air(mapped.observations, settings.transmission_per_m, air_K, band)
         emissivity = model_from_recipe(settings.emissivity, band)
+        around = surroundings(surface) if settings.crosscal.surroundings else None
+        transfer = open_transfer(surface.normals).astype(np.float32) if around is None else around.transfer
+        rows = changing.in_one_room(rows, transfer[:, 0], emissivity)
         excess = operator_excess(rows, emissivity, band, room.reflected_K)
         rows = without_operator(rows, excess, settings.operator_m2)
         clear, counts = clear_of_silhouettes(rows, len(surface), mapping.silhouette_px)
         rows, clear, excess = rows.select(counts), clear[counts], excess[counts]
-        around = surroundings(surface) if settings.crosscal.surroundings else None
         straight = rows.cos_angle >= np.float32(np.cos(np.radians(mapping.max_angle_deg)))
         held = settings.sigma_operator_m2 * operator_effect(rows, excess, straight, len(surface))
         straight_seen = np.bincount(rows.vertex[straight], minlength=len(surface)) > 0
@@ -116,7 +122,7 @@ class ThermalProblem:
             L_reflected=np.full(len(surface), L_room),
             around=around,
             errors=ErrorModel.of(camera, settings).aligned(mapped.outline_px, mapped.depth_scale),
-            blackbodies=expected_readings(mapped.blackbodies, scan.references, band, L_room),
+            blackbodies=changing.lit(expected_readings(mapped.blackbodies, scan.references, band, L_room)),
             contacts=contact_readings(scan.references, surface, band, scan.root),
             vertices_per_patch=vertices_per_patch(surface, normal_window_m),
             mapping=mapping,
@@ -124,7 +130,8 @@ class ThermalProblem:
             scatter=mapped.scatter,
             effects={"operator": held} | ({} if mapped.scattered is None else {"scatter": mapped.scattered}),
             room_map=RoomMap.unseen(_room_prior(room, settings, band)),
-            transfer=open_transfer(surface.normals).astype(np.float32) if around is None else around.transfer,
+            transfer=transfer,
+            changing=changing,
         )
         return problem.lit_by(np.full(len(surface), np.median(rows.radiance), np.float32))
 
@@ -249,18 +256,6 @@ def _restarts(usable: Bool, frame: Int) -> tuple[int, ...]:
     """Views before which a frame was marked unusable, the mark of a shutter; usable (F,), frame (M,) index."""
     marked = np.insert(np.cumsum(~usable), 0, 0)
     return tuple((np.flatnonzero(np.diff(marked[frame]) > 0) + 1).tolist())
-
-
-def remove_air_path(observations: Observations, transmission_per_m: float, L_air: float) -> Observations:
-    """Observations (N,) with the air between surface and camera removed: L = (L' - (1-τ) L_air)/τ, τ = τ₁^range.
-
-    L_air : W m-2 sr-1.
-    """
-    if transmission_per_m == 1.0:
-        return observations
-    tau = np.float32(transmission_per_m) ** observations.range_m
-    L = leaving_radiance(observations.radiance, transmission=tau, L_air=L_air)
-    return replace(observations, radiance=L.astype(np.float32))
 
 
 def vertices_per_patch(surface: SurfaceMesh, window_m: float) -> float:

@@ -174,7 +174,9 @@ def calibrated(
     overlap = Overlap.of(problem)
     plain = overlap.plain()
     if mapped.background is not None:
-        room = survey(mapped.background, plain, problem.room_prior, problem.errors.netd_K)
+        background = mapped.background
+        background = background if problem.changing is None else problem.changing.of_common_room(background)
+        room = survey(background, plain, problem.room_prior, problem.errors.netd_K)
         problem = problem.in_room(room.with_sides(*sides_of(overlap)), mapped.views)
         overlap = overlap.lit_again(problem)
         plain = overlap.plain()

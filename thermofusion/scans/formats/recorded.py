@@ -25,7 +25,7 @@ from ...files.reading import COPY_AGAIN, MAX_PIXELS, open_regular, read_head
 from ...files.ros import FRAME_INFO, IMAGE, VECTOR, FrameInfo, Picture, read_frame_info, read_picture, read_vector
 from ...files.strict import validated
 from ...geometry.rigid import pose
-from ...types import Camera, Environment, Float, Reference, Scan, Stream
+from ...types import Camera, Environment, Float, FrameConditions, Reference, Scan, Stream
 from ..clock import ClockFit, fit_clock
 from ..common import Kind, as_thermal, make_camera, make_rig, make_stream
 from ..native.compose import with_rig
@@ -435,7 +435,18 @@ def _with_thermal(scan: Scan, file: Path, thermal: _Recorded, clocks: Mapping[st
     if isinstance(band, list) and len(band) == 2 and "band_um" not in group.model_fields_set:
         low, high = (_within(x, BAND_UM, np.nan) for x in band)
         own = replace(own, band_um=(low, high)) if low + 0.1 < high else own
-    return replace(scan, thermal=as_thermal(_stream(file, thermal, clocks, own.lens, np.array), own))
+    stream = _stream(file, thermal, clocks, own.lens, np.array)
+    return replace(scan, thermal=as_thermal(stream, own, _sensor_of(thermal, stream)))
+
+
+def _sensor_of(recorded: _Recorded, stream: Stream) -> FrameConditions | None:
+    """The sensor's temperature with each frame of a stream, where the camera told it."""
+    from ..native.schema import CONDITIONS
+
+    degC = {entry.sequence: info.fpa_degC for entry, info in zip(recorded.frames, recorded.infos, strict=True)}
+    column = np.array([degC[int(number)] for number in stream.index])
+    low, high = CONDITIONS["fpa_degC"]
+    return FrameConditions.of(len(column), {"fpa_degC": np.where((column >= low) & (column <= high), column, np.nan)})
 
 
 # ---------------------------------------------------------------- what is said

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from ...errors import ScanError
 from ...files.reading import read_json
 from ...files.strict import validated
-from ...types import Camera, Float, Scan, ThermalCamera, ThermalStream
+from ...types import Camera, Environment, Float, FrameConditions, Scan, ThermalCamera, ThermalStream
 from ..common import as_thermal, make_rig, make_stream
 from ..thermal.frames import ThermalFrames
-from .schema import CameraDoc, DepthCorrectionDoc, RigDoc, camera_of, matrix_of, thermal_camera_of
+from .schema import CONDITIONS, CameraDoc, DepthCorrectionDoc, RigDoc, camera_of, matrix_of, thermal_camera_of
 
 CORRECTED_UNIT_M = 0.00025  # rounding to a millimetre would undo a correction of that size; 16 bits reach 16 m
 
@@ -162,7 +162,22 @@ def with_thermal(
     if room:
         said = ", ".join(f"{k} {v:g}" for k, v in room.items())
         notes.append(f"environment as the thermal camera was told, set it if you know better: {said}")
-    return replace(scan, thermal=as_thermal(stream, camera), environment=replace(own, **room), notes=tuple(notes))
+    told_each = _changing(frames.conditions, own)
+    thermal = as_thermal(stream, camera, told_each)
+    if told_each is not None:
+        notes.append(f"changes from frame to frame, as the thermal files say: {', '.join(told_each.stated)}")
+    return replace(scan, thermal=thermal, environment=replace(own, **room), notes=tuple(notes))
+
+
+def _changing(conditions: FrameConditions | None, stated: Environment) -> FrameConditions | None:
+    """What differs from frame to frame and the scan does not state for all: what stands still is the environment's."""
+    if conditions is None:
+        return None
+    known = {name: c for name, c in conditions.stated.items() if getattr(stated, name, None) is None}
+    inside = {name: np.where((c >= CONDITIONS[name][0]) & (c <= CONDITIONS[name][1]), c, np.nan)
+              for name, c in known.items()}  # fmt: skip
+    changing = {name: c for name, c in inside.items() if len(np.unique(c[np.isfinite(c)])) > 1}
+    return FrameConditions.of(len(conditions.air_degC), changing)
 
 
 def _check_common_time(scan: Scan, times_s: Float, place: object) -> None:

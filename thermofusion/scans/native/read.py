@@ -17,13 +17,13 @@ from ...files.reading import COPY_AGAIN, MAX_NAME, inside, is_named, read_json
 from ...files.strict import validated
 from ...files.table import table_rows
 from ...files.tum import read_trajectory
-from ...types import Camera, Environment, Scan, Stream
+from ...types import Camera, Environment, FrameConditions, Scan, Stream
 from ..common import ImageFiles, as_thermal, image_stream
-from .schema import SCHEMA, STREAMS, ScanDoc, reference_of, rig_of, thermal_camera_of, unknown_keys
+from .schema import CONDITIONS, SCHEMA, STREAMS, ScanDoc, reference_of, rig_of, thermal_camera_of, unknown_keys
 
 __all__ = ["SCHEMA", "STREAMS", "is_native", "read_native"]
 
-COLUMNS = ("stream", "index", "time_s", "path")  # of frames.csv; `shutter` and `fpa_degC` are optional
+COLUMNS = ("stream", "index", "time_s", "path")  # of frames.csv; `shutter` and `CONDITIONS` are optional
 
 
 def is_native(root: Path) -> bool:
@@ -44,7 +44,7 @@ def read_native(root: Path) -> Scan:
     camera = None if group is None else thermal_camera_of(group, doc.extrinsics, path)
     unit_m = doc.cameras.depth.depth_unit_m
     cameras = {"depth": rig.depth, "color": rig.color, "thermal": None if camera is None else camera.lens}
-    streams = _read_frames(root, cameras, unit_m)
+    streams, conditions = _read_frames(root, cameras, unit_m)
     if "depth" not in streams:
         raise ScanError("no depth frames are listed", place=root / "frames.csv")
     unknown = unknown_keys(doc)
@@ -57,7 +57,9 @@ def read_native(root: Path) -> Scan:
         rig=rig,
         depth=streams["depth"],
         color=streams.get("color"),
-        thermal=as_thermal(streams["thermal"], camera) if camera is not None and "thermal" in streams else None,
+        thermal=None
+        if camera is None or "thermal" not in streams
+        else as_thermal(streams["thermal"], camera, conditions),
         environment=Environment(**{k: getattr(doc.environment, k) for k in Environment.__dataclass_fields__}),
         references=tuple(
             reference_of(r, f"references.{i}", cameras["thermal"], path) for i, r in enumerate(doc.references)
@@ -80,9 +82,13 @@ class _Frames:
     times_s: array[float] = field(default_factory=lambda: array("d"))
     files: list[str] = field(default_factory=list)
     usable: bytearray = field(default_factory=bytearray)
+    conditions: dict[str, array[float]] = field(default_factory=lambda: {name: array("d") for name in CONDITIONS})
 
 
-def _read_frames(root: Path, cameras: Mapping[str, Camera | None], unit_m: float) -> dict[str, Stream]:
+def _read_frames(
+    root: Path, cameras: Mapping[str, Camera | None], unit_m: float
+) -> tuple[dict[str, Stream], FrameConditions | None]:
+    """The streams by kind, and what was measured beside the thermal frames."""
     path = root / "frames.csv"
     if not is_named(path):
         raise ScanError("there is no frames.csv here", place=root)
@@ -91,6 +97,7 @@ def _read_frames(root: Path, cameras: Mapping[str, Camera | None], unit_m: float
     for number, row in table_rows(path, "frames.csv", COLUMNS):
         try:
             kind, index, time_s, file, usable = _row(row, files)
+            measured = _measured(row) if kind == "thermal" else {}
         except ScanError as e:
             raise ScanError(e.cause, place=e.place or f"{path}, line {number}", hint=e.hint) from None
         frames = found.setdefault(kind, _Frames())
@@ -98,6 +105,8 @@ def _read_frames(root: Path, cameras: Mapping[str, Camera | None], unit_m: float
         frames.times_s.append(time_s)
         frames.files.append(file)
         frames.usable.append(usable)
+        for name, value in measured.items():
+            frames.conditions[name].append(value)
 
     streams: dict[str, Stream] = {}
     for kind in STREAMS:
@@ -111,7 +120,9 @@ def _read_frames(root: Path, cameras: Mapping[str, Camera | None], unit_m: float
             raise ScanError(f"an index of the {kind} stream stands twice", place=path)
         images = ImageFiles(kind, own.files, np.array(own.times_s), path, numbers, flags)
         streams[kind] = image_stream(images, camera, unit_m=unit_m)
-    return streams
+    thermal = found.get("thermal", _Frames())
+    columns = {name: np.array(column) for name, column in thermal.conditions.items() if column}
+    return streams, FrameConditions.of(len(thermal.index), columns)
 
 
 def _row(row: Mapping[str, str], files: _Files) -> tuple[str, int, float, str, bool]:
@@ -131,6 +142,22 @@ def _row(row: Mapping[str, str], files: _Files) -> tuple[str, int, float, str, b
         raise ScanError("the path is empty")
     usable = row.get("shutter", "").lower() in ("", "0", "false", "no")
     return stream, index, time_s, files.find(row["path"], stream), usable
+
+
+def _measured(row: Mapping[str, str]) -> dict[str, float]:
+    """What a row states of its frame, by column; NaN where the cell is empty. Raises ScanError."""
+    out = {}
+    for name, (low, high) in CONDITIONS.items():
+        if name not in row:
+            continue
+        try:
+            value = float(row[name] or "nan")
+        except ValueError:
+            raise ScanError(f"{name} must be a number or empty, got {row[name][:40]!r}") from None
+        if not (math.isnan(value) or low <= value <= high):
+            raise ScanError(f"{name} is {row[name][:40]}, expected {low:g} to {high:g}")
+        out[name] = value
+    return out
 
 
 class _Files:

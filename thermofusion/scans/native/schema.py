@@ -130,12 +130,27 @@ class ExtrinsicsDoc(Border):
     T_thermal_depth: list[list[float]] | None = None
 
 
+# What frames.csv may state of each thermal frame, with its bounds; the first three are `environment`'s, too.
+CONDITIONS: dict[str, tuple[float, float]] = {
+    "reflected_degC": (-80.0, 150.0),
+    "air_degC": (-60.0, 80.0),
+    "relative_humidity_pct": (0.0, 100.0),
+    "fpa_degC": (-80.0, 200.0),
+    "lens_degC": (-80.0, 200.0),
+}
+
+
+def _bounded(name: str) -> Any:
+    low, high = CONDITIONS[name]
+    return Field(None, ge=low, le=high)
+
+
 class EnvironmentDoc(Border):
     """`environment`: the room."""
 
-    reflected_degC: float | None = Field(None, ge=-80, le=150)
-    air_degC: float | None = Field(None, ge=-60, le=80)
-    relative_humidity_pct: float | None = Field(None, ge=0, le=100)
+    reflected_degC: float | None = _bounded("reflected_degC")
+    air_degC: float | None = _bounded("air_degC")
+    relative_humidity_pct: float | None = _bounded("relative_humidity_pct")
 
 
 class BlackbodyDoc(Border):

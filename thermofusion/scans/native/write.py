@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -20,10 +20,22 @@ from ...files.reading import PNG_MAGIC, decode_image, read_bytes
 from ...files.tum import write_trajectory
 from ...files.whole import replacing_folder
 from ...progress import Progress, silent
-from ...types import BlackbodyReference, Camera, LensScatter, Reference, Scan, Stream, ThermalCamera, Trajectory
-from ..common import Kind, as_loaded, as_thermal
+from ...types import (
+    BlackbodyReference,
+    Camera,
+    Float,
+    LensScatter,
+    Reference,
+    Scan,
+    Stream,
+    ThermalCamera,
+    ThermalStream,
+    Trajectory,
+)
+from ..common import Kind, as_loaded
 from .schema import SCHEMA, STREAMS
 
+S = TypeVar("S", bound=Stream)
 Selection = slice | Sequence[int] | NDArray
 
 _BYTES_PER_PIXEL = {"depth": 2.0, "color": 3.0, "thermal": 4.0}  # before compression: the disk-space estimate is high
@@ -47,7 +59,7 @@ def write_scan(scan: Scan, out: str | Path, overwrite: bool = False, progress: P
     with replacing_folder(out) as folder:
         rows = [row for kind in STREAMS for row in _write_stream(scan, kind, folder, progress)]
         rows.sort(key=lambda row: (float(row[2]), row[0]))
-        (folder / "frames.csv").write_text(_csv(rows), encoding="utf-8")
+        (folder / "frames.csv").write_text(_csv(rows, tuple(_measured(scan.thermal))), encoding="utf-8")
         (folder / "scan.json").write_text(json.dumps(scan_json(scan), indent=1) + "\n", encoding="utf-8")
         if scan.trajectory is not None:
             write_trajectory(folder / "trajectory.txt", scan.trajectory, exact=True)
@@ -128,16 +140,27 @@ def _write_stream(scan: Scan, kind: Kind, folder: Path, progress: Progress) -> l
     if stream is None:
         return []
     (folder / kind).mkdir()
-    rows = []
+    rows, measured = [], _measured(stream)
     for i in range(len(stream)):
         image = stream.load(i)
         data, suffix = _original(kind, stream.places[i], image, scan.depth_unit_m) or _encode(kind, image, scan, i)
         name = f"{kind}/{int(stream.index[i]):06d}.{suffix}"
         (folder / name).write_bytes(data)
         shutter = "" if stream.usable[i] else "1"
-        rows.append([kind, str(int(stream.index[i])), repr(float(stream.times_s[i])), name, shutter])
+        beside = [_cell(column[i]) for column in measured.values()]
+        rows.append([kind, str(int(stream.index[i])), repr(float(stream.times_s[i])), name, shutter, *beside])
         progress(kind, i + 1, len(stream))
     return rows
+
+
+def _measured(stream: Stream | None) -> dict[str, Float]:
+    """What was measured beside each of a stream's frames, by column of frames.csv."""
+    conditions = stream.conditions if isinstance(stream, ThermalStream) else None
+    return {} if conditions is None else conditions.stated
+
+
+def _cell(value: float) -> str:
+    return "" if np.isnan(value) else repr(float(value))
 
 
 def _original(kind: Kind, place: str, image: NDArray, unit_m: float) -> tuple[bytes, str] | None:
@@ -175,11 +198,12 @@ def _encode(kind: Kind, image: NDArray, scan: Scan, i: int) -> tuple[bytes, str]
     return buffer.tobytes(), suffix
 
 
-def _csv(rows: list[list[str]]) -> str:
-    text = io.StringIO()
+def _csv(rows: list[list[str]], measured: tuple[str, ...]) -> str:
+    """frames.csv; measured : columns that thermal rows alone fill."""
+    text, head = io.StringIO(), ("stream", "index", "time_s", "path", "shutter", *measured)
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["stream", "index", "time_s", "path", "shutter"])
-    writer.writerows(rows)
+    writer.writerow(head)
+    writer.writerows([*row, *[""] * (len(head) - len(row))] for row in rows)
     return text.getvalue()
 
 
@@ -231,10 +255,9 @@ def excerpt(
     t = scan.depth.times_s
     slack = 0.5 * float(np.median(np.diff(t))) if len(t) > 1 else 0.0
     span = (t[kept[0]] - slack, t[kept[-1]] + slack)
-    thermal_stream = None
+    thermal_stream: ThermalStream | None = None
     if scan.thermal is not None:
-        part = _cut(scan.thermal, thermal, span, scan.thermal.camera.time_offset_s)
-        thermal_stream = None if part is None else as_thermal(part, scan.thermal.camera)
+        thermal_stream = _cut(scan.thermal, thermal, span, scan.thermal.camera.time_offset_s)
     return replace(
         scan,
         depth=_take(scan.depth, kept),
@@ -255,20 +278,25 @@ def _positions(selection: Selection | None, n: int) -> NDArray[np.int64]:
     return np.unique(everything[picked]) if picked.size else everything[:0]
 
 
-def _take(stream: Stream, kept: NDArray[np.int64]) -> Stream:
+def _take(stream: S, kept: NDArray[np.int64]) -> S:
     positions = kept.tolist()
-    return Stream(
+    beside = {}
+    if isinstance(stream, ThermalStream) and stream.conditions is not None:
+        beside["conditions"] = stream.conditions.take(kept)
+    return replace(
+        stream,
         times_s=stream.times_s[kept],
         load=lambda i: stream.load(positions[i]),
         places=tuple(stream.places[k] for k in positions),
         index=stream.index[kept],
         usable=stream.usable[kept],
+        **beside,
     )
 
 
 def _cut(
-    stream: Stream | None, selection: Selection | None, span: tuple[float, float], offset_s: float
-) -> Stream | None:
+    stream: S | None, selection: Selection | None, span: tuple[float, float], offset_s: float
+) -> S | None:
     if stream is None:
         return None
     if selection is None:

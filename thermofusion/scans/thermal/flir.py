@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from ...errors import ScanError
 from ...files.reading import COPY_AGAIN, decode_image, open_regular, read_bytes, read_head
+from ...physics.air import AirModel
 from ...physics.band import ZERO_DEGC_K
-from ...types import Environment, Float32, SignalCurve
+from ...types import Environment, Float32, FrameConditions, SignalCurve
 from .frames import ThermalFrames, joined
 
 _RAW, _CAMERA = 0x01, 0x20  # types of FFF records: raw image, camera's parameters
@@ -71,12 +72,8 @@ class FlirParameters:
 
     def air_transmission(self) -> float:
         """Of half the path (FLIR's model splits it at the window), from distance and water in the air."""
-        t = self.air_degC
-        water = self.relative_humidity * np.exp(1.5587 + 0.06939 * t - 2.7816e-4 * t**2 + 6.8455e-7 * t**3)
-        root = np.sqrt(self.distance_m / 2)
-        a = np.exp(-root * (self.alpha1 + self.beta1 * np.sqrt(water)))
-        b = np.exp(-root * (self.alpha2 + self.beta2 * np.sqrt(water)))
-        return float(self.X * a + (1 - self.X) * b)
+        model = AirModel((self.alpha1, self.alpha2), (self.beta1, self.beta2), self.X)
+        return float(model.transmission(self.distance_m / 2, self.air_degC, self.relative_humidity))
 
     def temperature_degC(self, raw: NDArray) -> NDArray[np.float32]:
         """Object temperature of raw counts, any shape, by the file's own emissivity, reflection, air and window."""
@@ -177,9 +174,8 @@ def _frames(
 
         times = np.array([np.nan if heads[i][1] is None else heads[i][1] for i in group], np.float64)
         own = tuple(places[i] for i in group)
-        return ThermalFrames(
-            (shape[0], shape[1]), load, times, own, heads[group[0]][0].curve(), object_degC, _room(first), notes
-        )
+        curve, told = heads[group[0]][0].curve(), _told([heads[i][0] for i in group])
+        return ThermalFrames((shape[0], shape[1]), load, times, own, curve, object_degC, _room(first), notes, told)
 
     found = joined([of(g) for g in groups])
     _check_calibrated(found, first)
@@ -188,6 +184,13 @@ def _frames(
 
 def _room(p: FlirParameters) -> Environment:
     return Environment(round(p.reflected_degC, 2), round(p.air_degC, 2), round(100 * p.relative_humidity, 1))
+
+
+def _told(frames: list[FlirParameters]) -> FrameConditions | None:
+    """What the camera was told of the room with each frame."""
+    rooms = [_room(p) for p in frames]
+    columns = {name: np.array([getattr(room, name) for room in rooms]) for name in vars(rooms[0])}
+    return FrameConditions.of(len(frames), columns)
 
 
 def _noted(found: ThermalFrames, p: FlirParameters) -> ThermalFrames:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ...errors import ScanError
 from ...physics.band import ZERO_DEGC_K
 from ...physics.signal import counts_to_kelvin
-from ...types import Environment, Float, Float32, SignalCurve
+from ...types import Environment, Float, Float32, FrameConditions, SignalCurve
 
 APPARENT = SignalCurve("apparent_degC")
 
@@ -40,7 +40,8 @@ class ThermalFrames:
     shape : (H, W). load : i -> (H, W) as stored (uint16 counts or float32). times_s : (N,) the camera's own clock, s,
     NaN = not stated. places : where each came from. signal : how a stored value becomes an apparent blackbody
     temperature; None = the files do not say. object_degC : i -> (H, W) float32, by the file's own emissivity, distance
-    and room; for comparison only. environment : what the camera was told of the room. notes : what had to be assumed.
+    and room; for comparison only. environment : what the camera was told of the room, with the first frame;
+    conditions : with each. notes : what had to be assumed.
     """
 
     shape: tuple[int, int]
@@ -51,6 +52,7 @@ class ThermalFrames:
     object_degC: Callable[[int], Float32] | None = None
     environment: Environment = field(default_factory=Environment)
     notes: tuple[str, ...] = ()
+    conditions: FrameConditions | None = None
 
     def __len__(self) -> int:
         return len(self.places)
@@ -74,6 +76,7 @@ class ThermalFrames:
             times_s=self.times_s[kept],
             places=tuple(self.places[k] for k in rows),
             object_degC=None if object_degC is None else lambda i: object_degC(rows[i]),
+            conditions=None if self.conditions is None else self.conditions.take(kept),
         )
 
     def apparent_degC(self, i: int) -> Float:
@@ -139,7 +142,17 @@ def joined(parts: Sequence[ThermalFrames]) -> ThermalFrames:
         signal=first.signal if same else APPARENT,
         object_degC=object_degC if objects else None,
         notes=tuple(notes),
+        conditions=_conditions(parts, order),
     )
+
+
+def _conditions(parts: Sequence[ThermalFrames], order: NDArray[np.intp]) -> FrameConditions | None:
+    """Of all frames of some recordings (N,), put in an order (N,)."""
+    columns = {}
+    for name in (f.name for f in fields(FrameConditions)):
+        own = [np.full(len(p), np.nan) if p.conditions is None else getattr(p.conditions, name) for p in parts]
+        columns[name] = np.concatenate(own)[order]
+    return FrameConditions.of(len(order), columns)
 
 
 def _curve(signal: SignalCurve | None) -> object:

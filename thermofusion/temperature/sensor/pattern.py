@@ -8,6 +8,7 @@ is a linear term with a prior of one amplitude; `refine` says whether left-out v
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,7 +79,8 @@ class Pattern:
 
     drift_K, place_K, column_K, row_K : prior rms of each; 0 = absent. The last three stand still.
     stretch : (M,) number of each view's stretch between shutters. since : (M,) 0 ... 1, time since the shutter over
-    the longest stretch. coefficients : (Q,) W m-2 sr-1, drift first.
+    the longest stretch; or -1 ... 1, by how much the sensor has warmed since. coefficients : (Q,) W m-2 sr-1,
+    drift first.
     """
 
     width_px: int
@@ -96,9 +98,9 @@ class Pattern:
         """Nothing is added."""
         return not (self.drift_K or self.place_K or self.column_K or self.row_K)
 
-    def grown(self, sizes_K: dict[str, float]) -> Pattern:
-        """With parts of other amplitudes, K, by field name."""
-        return Pattern(**{**vars(self), **sizes_K})
+    def grown(self, changes: dict[str, Any]) -> Pattern:
+        """With parts of other amplitudes, K, by field name, or another `since`."""
+        return Pattern(**{**vars(self), **changes})
 
     @property
     def _drift_hats(self) -> Hats:
@@ -114,7 +116,7 @@ class Pattern:
         if self.drift_K:
             hats, tau, stretch = self._drift_hats.columns(u_px, v_px), self.since[view], self.stretch[view]
             K, n = hats.shape[1], int(self.stretch.max()) + 1
-            for rise in (tau, np.sqrt(tau) - tau):
+            for rise in (tau, np.sign(tau) * np.sqrt(np.abs(tau)) - tau):
                 index = hats.indices.reshape(-1, 4) + K * stretch[:, None]
                 parts.append(_rows(index, hats.data.reshape(-1, 4) * rise[:, None], K * n))
         if self.place_K:

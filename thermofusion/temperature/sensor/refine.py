@@ -8,6 +8,7 @@ predicted better with it by twice the standard error, each against the best alte
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,9 +76,11 @@ def refine(problem: ThermalProblem, system: OverlapSystem, solution: Solution, r
     before = statistics(left_out(system, solution, rows, points), width)
     floor = FLOOR_K * max(1.0, problem.errors.netd_K / FLOOR_NETD_K)
     judge = _Judge(problem, system, solution, rows)
-    kept, score, better, now = judge.bare, None, {}, before
+    better: dict[str, float] = {}
+    kept, score, now = judge.bare, None, before
     while problem.settings.crosscal.vignetting and problem.settings.crosscal.offsets:
-        tried = {name: kept.grown(sizes) for name, sizes in _asked(now, floor).items() if name not in better}
+        asked = _asked(now, floor) | judge.by_sensor(_asked(now, floor).get("drift"))
+        tried = {name: kept.grown(sizes) for name, sizes in asked.items() if not _has(better, name)}
         if not tried:
             break
         score = judge.score(kept) if score is None else score
@@ -104,7 +107,12 @@ def _beyond_chance(a: Alike, floor_K: float) -> bool:
     return a.z > MIN_Z and a.size_K > floor_K
 
 
-def _asked(found: dict[str, Alike], floor_K: float) -> dict[str, dict[str, float]]:
+def _has(better: dict[str, float], name: str) -> bool:
+    """Whether a term is there already: a drift goes with the time, or with one temperature."""
+    return any(term.split()[0] == name.split()[0] for term in better)
+
+
+def _asked(found: dict[str, Alike], floor_K: float) -> dict[str, dict[str, Any]]:
     """Terms that residuals ask for, beyond chance and the floor, with the amplitudes of their parts, K."""
     size = {name: a.size_K if _beyond_chance(a, floor_K) else 0.0 for name, a in found.items()}
     fixed = {f"{name}_K": FIXED_OVER_SIZE * size[name] for name in ("place", "column", "row") if size[name]}
@@ -136,6 +144,20 @@ class _Judge:
         stretch, since = _stretches(problem, system, solution)
         width, height = problem.lens.width_px, problem.lens.height_px
         self.bare = Pattern(width, height, 0.0, 0.0, 0.0, 0.0, stretch, since, np.zeros(0))
+        changing = problem.changing
+        self._sensor_degC = {} if changing is None else changing.sensor_degC
+
+    def by_sensor(self, drift: dict[str, Any] | None) -> dict[str, dict[str, Any]]:
+        """The drift that is asked for with how the sensor, or the lens, warmed since each shutter in place of time."""
+        out: dict[str, dict[str, Any]] = {}
+        if drift is None:
+            return out
+        for name, degC in self._sensor_degC.items():
+            first = np.searchsorted(self.bare.stretch, np.arange(self.bare.stretch.max() + 1))
+            warmed = degC - degC[first][self.bare.stretch]
+            if np.abs(warmed).max() > 0:
+                out[f"drift by {name}"] = {**drift, "since": warmed / np.abs(warmed).max()}
+        return out
 
     def solved(self, pattern: Pattern) -> tuple[OverlapSystem, Solution]:
         """All views with a pattern, or without where it is bare."""
