@@ -11,8 +11,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
 from pydantic import Field, JsonValue
 
+from ..errors import counted
 from ..files.reading import read_json
 from ..files.strict import Border, validated
 from ..physics.band import ZERO_DEGC_K
@@ -133,9 +135,14 @@ def radiometric_numbers(
     room, e = scan.environment, settings.emissivity
     shape = ", ".join(f"{k} = {v:g}" for k in ("n", "k", "epsilon0") if (v := getattr(e, k)) is not None)
     rows = [("emissivity ε(θ)", f"{e.model}{', ' * bool(shape)}{shape}", "recipe")]
-    for what, chosen, of_scan in (("reflected temperature", settings.reflected_degC, room.reflected_degC),
-                                  ("air temperature", settings.air_degC, room.air_degC)):  # fmt: skip
-        if chosen is not None or of_scan is not None:
+    each = _frame_by_frame(scan)
+    for what, key, chosen, of_scan in (
+        ("reflected temperature", "reflected_degC", settings.reflected_degC, room.reflected_degC),
+        ("air temperature", "air_degC", settings.air_degC, room.air_degC),
+    ):
+        if chosen is None and key in each:
+            rows.append((what, *each[key]))
+        elif chosen is not None or of_scan is not None:
             value, source = (of_scan, "scan.json") if chosen is None else (chosen, "recipe")
             rows.append((what, f"{value:g} °C", source))
         else:
@@ -144,8 +151,12 @@ def radiometric_numbers(
         if i.name == "reflected" and i.kind == "A":
             seen = f"{i.value - ZERO_DEGC_K:.2f} ± {i.u:.2f} °C"
             rows.insert(2, ("reflected temperature that was used", seen, "background of the views"))
-    if room.relative_humidity_pct is not None:
+    if "relative_humidity_pct" in each:
+        rows.append(("humidity", *each["relative_humidity_pct"]))
+    elif room.relative_humidity_pct is not None:
         rows.append(("humidity", f"{room.relative_humidity_pct:g} %", "scan.json"))
+    for what, key in (("temperature of the sensor", "fpa_degC"), ("temperature of the lens", "lens_degC")):
+        rows += [(what, *each[key])] if key in each else []
     rows.append(("transmission of a metre of air", f"{settings.transmission_per_m:g}", "recipe"))
     rows.append(("uncertainty of the reflected temperature", f"{settings.sigma_reflected_K:g} K", "recipe"))
     rows.append(("uncertainty of ε(0)", f"{settings.sigma_emissivity0:g}", "recipe"))
@@ -157,3 +168,17 @@ def radiometric_numbers(
         rows.append(("signal", curve, "scan.json"))
     rows += [(f"reference: {r.kind}", f"{r.degC:g} ± {r.uncertainty_K:g} °C", "scan.json") for r in scan.references]
     return [dict(zip(("what", "value", "source"), row, strict=True)) for row in rows]
+
+
+def _frame_by_frame(scan: Scan) -> dict[str, tuple[str, str]]:
+    """What is stated of each thermal frame, by column: (its range, where it stands)."""
+    if scan.thermal is None or scan.thermal.conditions is None:
+        return {}
+    source = "frames.csv" if scan.format == "native" else "the recording"
+    out = {}
+    for name, column in scan.thermal.conditions.stated.items():
+        known = column[np.isfinite(column)]
+        unit = "%" if name.endswith("_pct") else "°C"
+        stated = f"{known.min():g} to {known.max():g} {unit}, stated of {counted(len(known), 'frame')}"
+        out[name] = stated, source
+    return out

@@ -294,9 +294,7 @@ def _take(stream: S, kept: NDArray[np.int64]) -> S:
     )
 
 
-def _cut(
-    stream: S | None, selection: Selection | None, span: tuple[float, float], offset_s: float
-) -> S | None:
+def _cut(stream: S | None, selection: Selection | None, span: tuple[float, float], offset_s: float) -> S | None:
     if stream is None:
         return None
     if selection is None:
