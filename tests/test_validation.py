@@ -128,6 +128,19 @@ def test_the_maps_own_error_is_told_without_truth(seed, netd_K, drift_K, normal_
     assert told.coverage > 0.9
 
 
+def test_three_views_are_enough():
+    """One view has no overlap to be calibrated by: views are left out one at a time. Right in the mean of six worlds:
+    what three views say of their own calibration is as uncertain as the calibration."""
+    told, true = [], []
+    for seed in range(6):
+        world = make_world(seed, n_vertices=1500, n_views=3, turn_deg=60.0, field=False)
+        bench = make_bench(world, 0.05, field=False)
+        truth, sigma_K = true_error(world, bench)
+        true.append(truth.mae_K)
+        told.append(map_error(bench, bench, surface_of(world), sigma_K, psf_sigma_px=0.0).error.mae_K)
+    assert np.mean(told) == pytest.approx(np.mean(true), rel=0.25)
+
+
 def test_point_spread_is_found_in_the_map():
     """Stripes that the point spread flattens by 15 %: what it took off, told from the map within a quarter."""
     wave, sigma_m = 0.05, 0.0045

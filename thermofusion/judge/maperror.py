@@ -172,8 +172,22 @@ def _calibration_error(bench: Bench, calibration: Calibration, place_m: NDArray,
     """(V,) K, what a calibration from other views and other skin would change, halved.
 
     Views alternate singly, in pairs or in threes: longer arcs would cut the chain of overlaps that the whole scan has.
-    Skin alternates in cubes: errors of normals are common to all views of a patch.
+    Skin alternates in cubes: errors of normals are common to all views of a patch. Where a half has too few views to be
+    calibrated by itself, one view is left out instead (the jackknife, Quenouille 1956), another in each cut.
     """
+    try:
+        return _by_halves(bench, calibration, place_m, k)
+    except ScanError:
+        views = bench.problem.seen_views
+        mask = np.ones(bench.problem.n_views, bool)
+        mask[views[k % len(views)]] = False
+        own = bench.blend(mask, bench.calibrate(mask))
+        change = own.temperature_K - bench.blend(mask, calibration).temperature_K
+        return np.asarray(np.sqrt(len(views) - 1) * change)
+
+
+def _by_halves(bench: Bench, calibration: Calibration, place_m: NDArray, k: int) -> Float:
+    """(V,) K, half the difference of two calibrations from half of the views and of the skin each."""
     cube = np.floor(place_m / PATCH_M + 0.5 * k).astype(int).sum(1) % 2 == 0
     change = []
     for mask, skin in zip(_by_turns(bench, k + 1, 0), (cube, ~cube), strict=True):

@@ -33,6 +33,7 @@ MIN_STRETCH_VIEWS = 4
 FOLDS = 3
 SOLVE_STEPS = 6  # of reweighting: from the solution without a pattern
 CLIP_SIGMAS = 4.0  # left-out residuals count up to here
+MIN_JUDGED = 3  # views that must be left out for that
 MIN_GAIN_SE = 2.0  # standard errors by which left-out views must be predicted better
 
 
@@ -84,6 +85,8 @@ def refine(problem: ThermalProblem, system: OverlapSystem, solution: Solution, r
         if not tried:
             break
         score = judge.score(kept) if score is None else score
+        if np.isfinite(score).sum() < MIN_JUDGED:
+            break  # too few views to leave any out
         scores = {name: judge.score(pattern) for name, pattern in tried.items()}
         best = min(scores, key=lambda name: float(np.nanmean(scores[name])))
         gain = (score - scores[best])[np.isfinite(score)]
