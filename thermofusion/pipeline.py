@@ -24,7 +24,7 @@ from .report.summary import Steps, summary
 from .results.claim import REPORT, claimed, complete
 from .results.folder import RESULT, Result, add_files, load_mesh, names_of, write_result
 from .results.frame import frame_of
-from .results.stages import Computes, Stage, StagePlan, Stages, fingerprint, run_id
+from .results.stages import Computes, Stage, StagePlan, Stages, fingerprint, run_id, said_to
 from .scans.check import verify
 from .types import Scan
 from .version import __version__
@@ -154,7 +154,7 @@ class _Run:
         self.scan = scan if scan.thermal is None else replace(scan, thermal=scan.thermal.kept(KEPT_THERMAL_BYTES))
         self.ahead: Ahead | None = None
         self.first_anew, self.last = _position(redo_from, len(STAGES)), _position(until, len(STAGES) - 1)
-        self.stages = Stages(folder, {"thermofusion": __version__, "scan": fingerprint(scan)}, recipe)
+        self.stages = Stages(folder, {"thermofusion": __version__, "scan": fingerprint(scan)}, recipe, said_to(scan))
         self.casts: Future[list[Cast]] | None = None
 
     def result(self) -> Result:

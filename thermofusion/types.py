@@ -248,6 +248,27 @@ Reference = BlackbodyReference | ContactReference
 
 
 @dataclass(frozen=True, eq=False)
+class Material:
+    """Part of the surface that is not bare skin, as the user states it.
+
+    emissivity : keys of the recipe's `temperature.emissivity`; `skin` = as the recipe has it; None = its temperature
+    cannot be read. sigma_emissivity0 : of its ε(0), None = not stated. not_skin : all that is found not to behave as
+    skin belongs to it. polygons_px : (thermal frame's `index`, (N, 2) pixels) each. vertices : (M,) of the surface,
+    whose number of_vertices tells whether it still is the same; 0 = not told.
+    """
+
+    name: str
+    emissivity: dict[str, object] | Literal["skin"] | None
+    sigma_emissivity0: float | None = None
+    not_skin: bool = False
+    polygons_px: tuple[tuple[int, Float], ...] = ()
+    vertices: Int = field(default_factory=lambda: np.zeros(0, np.int32))
+    of_vertices: int = 0
+
+    __repr__ = brief
+
+
+@dataclass(frozen=True, eq=False)
 class Stream:
     """One camera's images in time order.
 
@@ -383,6 +404,7 @@ class Scan:
     thermal: ThermalStream | None = None
     environment: Environment = field(default_factory=Environment)
     references: tuple[Reference, ...] = ()
+    materials: tuple[Material, ...] = ()
     trajectory: Trajectory | None = None
     depth_unit_m: float = 0.001
     depth_up: tuple[float, float, float] = (0.0, -1.0, 0.0)  # which way is up for the depth camera as it was held

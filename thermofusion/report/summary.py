@@ -300,6 +300,7 @@ def _temperature(t: Temperature) -> dict[str, Any]:
         "flags": flags,
         "crosscal": t.crosscal,
         "inputs": [vars(i) for i in t.inputs],
+        "materials": t.materials,
         "room": {} if t.room is None else t.room.told(),
         "criticism": {} if t.calibration is None else t.calibration.criticism,
     }

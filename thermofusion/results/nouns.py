@@ -116,7 +116,8 @@ def stored() -> MappingProxyType[str, type]:
             "rig/1": RigResult,  # without `free`, `frame_dt_s`, `depth_scale`
             "room-map/1": RoomMap,
             "sensor-pattern/1": Pattern,
-            "temperature/4": Temperature,
+            "temperature/5": Temperature,
+            "temperature/4": Temperature,  # without `materials`
             "temperature/3": Temperature,  # without `inputs`
             "temperature/2": Temperature,  # without `room`
             "temperature/1": Temperature,  # without `shared`

@@ -22,6 +22,7 @@ from ..types import Scan
 from .artifacts import load_artifact, load_note, save_artifact
 
 T = TypeVar("T", covariant=True)
+BY_STAGE = {"materials": "temperature"}  # fields of a scan that one stage alone reads
 WORK = "stages"  # sub-folder of a result that holds the artifacts
 # What version 0.1.0 left there under other names.
 STALE = (
@@ -77,8 +78,11 @@ class Computes(Protocol[T]):
 class Stages:
     """Runs stages in order and remembers their results in a folder (or not at all, without a folder)."""
 
-    def __init__(self, folder: Path | None, base: Mapping[str, Any], recipe: Recipe) -> None:
-        self._folder = folder
+    def __init__(
+        self, folder: Path | None, base: Mapping[str, Any], recipe: Recipe, said: Mapping[str, Any] | None = None
+    ) -> None:
+        """said : by stage, what of the scan that stage alone reads."""
+        self._folder, self._said = folder, dict(said or {})
         self._base, self._recipe = dict(base), recipe
         self.key = _hash(base)
         self.note: dict[str, Any] = {}
@@ -107,7 +111,7 @@ class Stages:
 
     def _look(self, stage: Stage, anew: bool) -> tuple[Path | None, str]:
         """The file whose artifact is as good as computing, and why it is, or why there is none."""
-        sections = plain(stage.sections(self._recipe))
+        sections = plain(stage.sections(self._recipe) | self._said.get(stage.name, {}))
         self.key = _hash({"before": self.key, "stage": stage.name, "edition": stage.edition, "inputs": sections})
         if self._folder is None:
             return None, "nothing is stored"
@@ -136,7 +140,8 @@ class Stages:
                 (self._folder / WORK / name).unlink(missing_ok=True)
 
     def _inputs(self, stage: Stage) -> dict[str, Any]:
-        inputs = {**self._base, "edition": stage.edition, **_flat(plain(stage.sections(self._recipe)))}
+        sections = plain(stage.sections(self._recipe) | self._said.get(stage.name, {}))
+        inputs = {**self._base, "edition": stage.edition, **_flat(sections)}
         return json.loads(json.dumps(inputs))
 
 
@@ -162,10 +167,20 @@ def fingerprint(scan: Scan) -> str:
                 h.update(place.encode("utf-8", "surrogateescape"))
     if scan.thermal is not None and scan.thermal.conditions is not None:
         h.update(_hash(scan.thermal.conditions.stated).encode())
-    rest = {f.name: getattr(scan, f.name) for f in dataclasses.fields(scan) if f.name not in (*streams, "root")}
+    apart = (*streams, "root", *BY_STAGE)
+    rest = {f.name: getattr(scan, f.name) for f in dataclasses.fields(scan) if f.name not in apart}
     rest["thermal camera"] = None if scan.thermal is None else scan.thermal.camera
     h.update(_hash(rest).encode())
     return h.hexdigest()[:24]
+
+
+def said_to(scan: Scan) -> dict[str, dict[str, object]]:
+    """By stage, what of the scan that stage alone reads: a change of it leaves the stages before as they are."""
+    out: dict[str, dict[str, object]] = {}
+    for name, stage in BY_STAGE.items():
+        if getattr(scan, name):
+            out.setdefault(stage, {})[name] = _hash(getattr(scan, name))
+    return out
 
 
 def run_id(key: str, output: object) -> str:

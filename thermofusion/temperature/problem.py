@@ -43,6 +43,7 @@ class ThermalProblem:
     light a vertex. uneven : (V,) what the room adds to what vertices reflect, beyond its mean. scatter : of the
     lens. effects : (V,) what one sigma of it, or of who stands at the camera, does to readings of a vertex. changing :
     what differed from view to view; its room and air are off the observations.
+    hemispherical : (V,) ε of vertices to what is around them; None: all are skin.
     """
 
     vertices: NDArray[np.intp]
@@ -72,6 +73,7 @@ class ThermalProblem:
     scatter: LensScatter | None = None
     effects: Mapping[str, Float32] = field(default_factory=dict)
     changing: Changing | None = None
+    hemispherical: Float | None = None
 
     @classmethod
     def of(
@@ -148,7 +150,8 @@ class ThermalProblem:
         if self.around is None:
             return self
         L_room = float(self.band.radiance(self.room.reflected_K))
-        lit = self.around.reflected_radiance(L_room, L_skin, emissivity=self.emissivity.hemispherical)
+        sends = self.emissivity.hemispherical if self.hemispherical is None else self.hemispherical
+        lit = self.around.reflected_radiance(L_room, L_skin, emissivity=sends)
         return replace(self, L_reflected=lit if self.uneven is None else lit + self.uneven)
 
     @property
@@ -214,7 +217,8 @@ class ThermalProblem:
 
     def without(self, vertices: Bool) -> ThermalProblem:
         """The vertices of a mask (V,) are not skin: they take no part in calibration."""
-        return replace(self, clear=self.clear & ~vertices[self.observations.vertex], other=vertices)
+        other = vertices if self.other is None else self.other | vertices
+        return replace(self, clear=self.clear & ~vertices[self.observations.vertex], other=other)
 
     def sample(self, size: int) -> ThermalProblem:
         """An even sample of some `size` of the vertices that were seen, and those under contact thermometers."""

@@ -32,6 +32,7 @@ from ..types import (
 from .blend import BlendResult, blend
 from .crosscal import Calibration, Overlap
 from .inputs import inputs_of
+from .materials import Covers
 from .passed_over import contradicted, doubtful_with_neighbours
 from .problem import ThermalProblem
 from .room.map import RoomMap
@@ -60,7 +61,8 @@ class Temperature:
     body_fraction : (V,) F, or None. level_sigma_K : one sigma of the level common to all vertices, by part; a single
     vertex's absolute interval is √(uncertainty² + Σ level²). crosscal : for the report; methods : of old results.
     shared : what errors of vertices have in common; None where nothing tells (version 0.1.0 wrote the result, say).
-    room : its radiance by direction, as it was used. inputs : what the temperatures depend on, for budgets.
+    room : its radiance by direction, as it was used. inputs : what the temperatures depend on, for budgets. materials :
+    by name, what was read of the parts that are not bare skin.
     """
 
     mesh: ThermalMesh
@@ -76,6 +78,7 @@ class Temperature:
     shared: SharedErrors | None = None
     room: RoomMap | None = None
     inputs: tuple[BudgetInput, ...] = ()
+    materials: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     __repr__ = brief
 
@@ -117,13 +120,18 @@ def solve(
     normal_window_m : over which the mesh's normals were averaged. Raises ScanError, RecipeError.
     """
     problem = ThermalProblem.of(scan, mesh, normal_window_m, mapped, mapping, temperature)
+    covers = Covers.of(scan, mapped, problem)
+    problem = covers.apart_from(problem)
     progress("temperature", 1, 4)
     problem, calibration, notes, other, first = calibrated(problem, mapped)
     problem = problem.without(other) if other.any() else problem
+    covers = covers.with_found(other)
+    problem = covers.sent(problem)
     progress("temperature", 2, 4)
-    problem = problem.informed(mesh, first.absolute_K)
+    problem = problem.informed(mesh, covers.read(first, problem, calibration, with_uncertainty=False).absolute_K)
     progress("temperature", 3, 4)
-    result = blend(problem, calibration)
+    result = covers.read(blend(problem, calibration), problem, calibration)
+    other = other | covers.anywhere
     progress("temperature", 4, 4)
     body_fraction = None if problem.around is None else problem.around.body_fraction
     shown = _mesh(mesh, result, calibration, _cavity(problem), problem.room, other)
@@ -143,10 +151,11 @@ def solve(
         calibration=calibration,
         level_sigma_K=result.uncertainty.level_parts_K,
         crosscal={} if calibration is None else _crosscal_report(calibration, mapped, problem, result),
-        messages=(*problem.room.assumed, *notes),
+        messages=(*problem.room.assumed, *notes, *covers.said),
         shared=_shared(result, problem.lens.focal_px, normal_window_m),
         room=problem.room_map,
-        inputs=inputs_of(problem, calibration),
+        inputs=(*inputs_of(problem, calibration), *covers.inputs),
+        materials=covers.told(result),
     )
 
 

@@ -19,7 +19,17 @@ from ...files.table import table_rows
 from ...files.tum import read_trajectory
 from ...types import Camera, Environment, FrameConditions, Scan, Stream
 from ..common import ImageFiles, as_thermal, image_stream
-from .schema import CONDITIONS, SCHEMA, STREAMS, ScanDoc, reference_of, rig_of, thermal_camera_of, unknown_keys
+from .schema import (
+    CONDITIONS,
+    SCHEMA,
+    STREAMS,
+    ScanDoc,
+    material_of,
+    reference_of,
+    rig_of,
+    thermal_camera_of,
+    unknown_keys,
+)
 
 __all__ = ["SCHEMA", "STREAMS", "is_native", "read_native"]
 
@@ -63,6 +73,9 @@ def read_native(root: Path) -> Scan:
         environment=Environment(**{k: getattr(doc.environment, k) for k in Environment.__dataclass_fields__}),
         references=tuple(
             reference_of(r, f"references.{i}", cameras["thermal"], path) for i, r in enumerate(doc.references)
+        ),
+        materials=tuple(
+            material_of(m, f"materials.{i}", cameras["thermal"], path) for i, m in enumerate(doc.materials)
         ),
         trajectory=read_trajectory(trajectory_file) if is_named(trajectory_file) else None,
         depth_unit_m=unit_m,

@@ -7,16 +7,19 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, Field, field_validator
+from pydantic import BaseModel, Field, field_validator, model_validator
 
 from ...errors import ScanError
-from ...files.reading import read_json
+from ...files.npz import read_npz
+from ...files.reading import inside, read_json
 from ...files.strict import Border, validated
+from ...recipe import EmissivitySection
 from ...types import (
     BlackbodyReference,
     Camera,
     ContactReference,
     LensScatter,
+    Material,
     Reference,
     Rig,
     SignalCurve,
@@ -29,6 +32,7 @@ STREAMS: tuple[Kind, ...] = ("depth", "color", "thermal")
 MAX_BASELINE_M = 10.0  # between cameras of one rig: more is in other units than metres
 MIN_BAND_UM = 0.1  # width of a thermal camera's band
 MIN_POLYGON_PX2 = 1.0  # area of a reference in the thermal image
+MAX_VERTICES = 50_000_000  # of a surface: far above what a scan gives
 UP_LENGTH = (0.1, 100.0)  # of the `up` vector: a unit vector, or an accelerometer's m/s²
 
 Constant = Annotated[float, Field(ge=-1e12, le=1e12)]  # of a radiometric curve: Planck's R reaches 1e9
@@ -181,6 +185,33 @@ class ContactDoc(Border):
     p_world_m: tuple[Metres, Metres, Metres]
 
 
+class OutlineDoc(Border):
+    """An outline in one thermal picture."""
+
+    frame: FrameIndex
+    thermal_polygon_px: list[tuple[Pixels, Pixels]] = Field(min_length=3, max_length=1000)
+
+
+class MaterialDoc(Border):
+    """`materials`: a part of the surface that is not bare skin; without `emissivity` it gets no temperature."""
+
+    name: str = Field(min_length=1, max_length=60)
+    emissivity: EmissivitySection | Literal["skin"] | None = None
+    sigma_emissivity0: float | None = Field(None, ge=0.001, le=0.5)
+    not_skin: bool = False
+    polygons: list[OutlineDoc] = Field(default_factory=list, max_length=1000)
+    vertices: list[FrameIndex] = Field(default_factory=list, max_length=MAX_VERTICES)
+    of_vertices: int = Field(0, ge=0, le=MAX_VERTICES)
+    labels: str | None = None
+    label: int = Field(1, ge=0, lt=2**31)
+
+    @model_validator(mode="after")
+    def _is_somewhere(self) -> MaterialDoc:
+        if not (self.polygons or self.vertices or self.labels or self.not_skin):
+            raise ValueError("where it is must be said: polygons, vertices, labels or not_skin")
+        return self
+
+
 class ScanDoc(Border):
     """scan.json."""
 
@@ -193,6 +224,7 @@ class ScanDoc(Border):
     references: list[Annotated[BlackbodyDoc | ContactDoc, Field(discriminator="kind")]] = Field(
         default_factory=list, max_length=1000
     )
+    materials: list[MaterialDoc] = Field(default_factory=list, max_length=100)
     subject: dict[str, Any] = Field(default_factory=dict)
     notes: list[str] = Field(default_factory=list)
     times_assumed: bool = False
@@ -351,6 +383,32 @@ def reference_of(doc: BlackbodyDoc | ContactDoc, key: str, thermal: Camera | Non
             raise ScanError(f"key '{key}.thermal_polygon_px': beyond the thermal image of {size}", place=path)
         return BlackbodyReference(doc.degC, doc.uncertainty_K, doc.emissivity, polygon, tuple(doc.frames))
     return ContactReference(doc.degC, doc.uncertainty_K, np.array(doc.p_world_m, np.float64))
+
+
+def material_of(doc: MaterialDoc, key: str, thermal: Camera | None, path: Path) -> Material:
+    """A material group; key : its own, for messages. Labels are read from their file beside scan.json."""
+    polygons = []
+    for i, p in enumerate(doc.polygons):
+        corners = np.array(p.thermal_polygon_px, np.float64)
+        if thermal is None or (corners > [thermal.width_px - 0.5, thermal.height_px - 0.5]).any():
+            size = "" if thermal is None else f" of {thermal.width_px} x {thermal.height_px} px"
+            raise ScanError(f"key '{key}.polygons.{i}.thermal_polygon_px': beyond the thermal image{size}", place=path)
+        polygons.append((p.frame, corners))
+    section = doc.emissivity
+    emissivity = section.model_dump(exclude_unset=True) if isinstance(section, EmissivitySection) else section
+    vertices, of_vertices = np.unique(np.array(doc.vertices, np.int64)), doc.of_vertices
+    if doc.labels is not None:
+        file = inside(path.parent, doc.labels, place=f"{path}: key '{key}.labels'")
+        (labels,) = read_npz(file, "label file", ["labels"], hint="an .npz with `labels`, a whole number a vertex")
+        if labels.ndim != 1 or labels.dtype.kind not in "biu":
+            raise ScanError("`labels` must be one whole number a vertex", place=file)
+        if of_vertices not in (0, len(labels)):
+            raise ScanError(f"key '{key}.of_vertices': {of_vertices}, but there are {len(labels)} labels", place=path)
+        vertices, of_vertices = np.union1d(vertices, np.flatnonzero(labels == doc.label)), len(labels)
+    if of_vertices and vertices.max(initial=0) >= of_vertices:
+        raise ScanError(f"key '{key}.vertices': {vertices.max()} is none of {of_vertices} vertices", place=path)
+    where = tuple(polygons), vertices.astype(np.int32), of_vertices
+    return Material(doc.name, emissivity, doc.sigma_emissivity0, doc.not_skin, *where)
 
 
 def unknown_keys(doc: BaseModel, prefix: str = "") -> list[str]:

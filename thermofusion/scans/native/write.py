@@ -25,6 +25,7 @@ from ...types import (
     Camera,
     Float,
     LensScatter,
+    Material,
     Reference,
     Scan,
     Stream,
@@ -89,6 +90,7 @@ def scan_json(scan: Scan) -> dict[str, Any]:
         "extrinsics": extrinsics,
         "environment": environment,
         "references": [_reference(r) for r in scan.references],
+        **({"materials": [_material(m) for m in scan.materials]} if scan.materials else {}),
         "subject": scan.subject,
         **({"notes": list(scan.notes)} if scan.notes else {}),
         **({"times_assumed": True} if scan.times_assumed else {}),
@@ -133,6 +135,19 @@ def _reference(r: Reference) -> dict[str, Any]:
         polygon = r.polygon_px.tolist()
         return {**common, "emissivity": r.emissivity, "thermal_polygon_px": polygon, "frames": list(r.frames)}
     return {**common, "p_world_m": r.p_world_m.tolist()}
+
+
+def _material(m: Material) -> dict[str, Any]:
+    polygons = [{"frame": frame, "thermal_polygon_px": corners.tolist()} for frame, corners in m.polygons_px]
+    return {
+        "name": m.name,
+        **({} if m.emissivity is None else {"emissivity": m.emissivity}),
+        **({} if m.sigma_emissivity0 is None else {"sigma_emissivity0": m.sigma_emissivity0}),
+        **({"not_skin": True} if m.not_skin else {}),
+        **({"polygons": polygons} if polygons else {}),
+        **({"vertices": m.vertices.tolist()} if len(m.vertices) else {}),
+        **({"of_vertices": m.of_vertices} if m.of_vertices else {}),
+    }
 
 
 def _write_stream(scan: Scan, kind: Kind, folder: Path, progress: Progress) -> list[list[str]]:
