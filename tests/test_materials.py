@@ -104,6 +104,11 @@ def test_what_is_found_not_to_be_skin_goes_to_the_material_that_claims_it():
     assert covers.with_found(other).covers[0].vertices.tolist() == [2, 7, 8]  # 3 is cream, as somebody said
     assert covers.with_found(other).covers[1] is covers.covers[1]
     assert covers.with_found(np.zeros(10, bool)) is covers
+    film = replace(covers, covers=(covers.covers[0], replace(covers.covers[1], as_warm=True)))
+    assert np.flatnonzero(film.with_found(other).flagged(other)).tolist() == [2, 7, 8]
+    assert np.flatnonzero(covers.with_found(other).flagged(other)).tolist() == [2, 3, 4, 7, 8]
+    unread = replace(film, covers=(replace(film.covers[1], model=None),))
+    assert np.flatnonzero(unread.flagged(other)).tolist() == [2, 3, 4, 7]
 
 
 # ---------------------------------------------------------------- through a whole run
@@ -192,11 +197,16 @@ def test_what_is_stated_survives_writing_and_what_is_wrong_is_named(tmp_path):
     whole = {"polygons": [{"frame": 2, "thermal_polygon_px": [[20, 20], [50, 20], [50, 30]]}]}
     numbers = {"vertices": [3, 1, 2], "of_vertices": 9, "sigma_emissivity0": 0.04}
     root = stated(
-        bare, tmp_path / "one", DRESSING | numbers | whole, {"name": "hair", "not_skin": True, "emissivity": "skin"}
+        bare,
+        tmp_path / "one",
+        DRESSING | numbers | whole,
+        {"name": "hair", "not_skin": True, "counts_as_skin": True, "emissivity": "skin"},
     )
     m, hair = open_scan(write_scan(open_scan(root), tmp_path / "two")).materials
     assert (m.name, m.emissivity, m.sigma_emissivity0) == ("dressing", DRESSING["emissivity"], 0.04)
     assert (m.vertices.tolist(), m.of_vertices, m.polygons_px[0][0]) == ([1, 2, 3], 9, 2)
+    assert hair.counts_as_skin
+    assert not m.counts_as_skin
     assert (hair.name, hair.emissivity, hair.sigma_emissivity0, hair.not_skin) == ("hair", "skin", None, True)
     wrong = (
         ({}, "where it is must be said"),

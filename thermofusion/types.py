@@ -253,14 +253,16 @@ class Material:
 
     emissivity : keys of the recipe's `temperature.emissivity`; `skin` = as the recipe has it; None = its temperature
     cannot be read. sigma_emissivity0 : of its ε(0), None = not stated. not_skin : all that is found not to behave as
-    skin belongs to it. polygons_px : (thermal frame's `index`, (N, 2) pixels) each. vertices : (M,) of the surface,
-    whose number of_vertices tells whether it still is the same; 0 = not told.
+    skin belongs to it. counts_as_skin : a film as warm as the skin below it: means over skin take it in. polygons_px :
+    (thermal frame's `index`, (N, 2) pixels) each. vertices : (M,) of the surface, whose number of_vertices tells
+    whether it still is the same; 0 = not told.
     """
 
     name: str
     emissivity: dict[str, object] | Literal["skin"] | None
     sigma_emissivity0: float | None = None
     not_skin: bool = False
+    counts_as_skin: bool = False
     polygons_px: tuple[tuple[int, Float], ...] = ()
     vertices: Int = field(default_factory=lambda: np.zeros(0, np.int32))
     of_vertices: int = 0

@@ -35,7 +35,8 @@ PART = "material"  # of the budget
 class Cover:
     """One material: where it was found (N,), and its ε(θ), or the reason why it has no temperature.
 
-    is_skin : its ε(θ) is the skin's. not_skin : it also is what is found not to behave as skin.
+    is_skin : its ε(θ) is the skin's. not_skin : it also is what is found not to behave as skin. as_warm : as the skin
+    below it, of which its temperature may be taken to be one.
     """
 
     name: str
@@ -45,6 +46,7 @@ class Cover:
     reason: str = ""
     is_skin: bool = False
     not_skin: bool = False
+    as_warm: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +79,14 @@ class Covers:
         for cover in self.covers:
             if not cover.is_skin:
                 out[cover.vertices] = True
+        return out
+
+    def flagged(self, other: Bool) -> Bool:
+        """(V,) what is no skin: what was found (V,) or stated, less films as warm as the skin that could be read."""
+        out = other | self.anywhere
+        for cover in self.covers:
+            if cover.as_warm and cover.model is not None:
+                out[cover.vertices] = False
         return out
 
     def with_found(self, other: Bool) -> Covers:
@@ -217,7 +227,8 @@ def _inside(u: NDArray, v: NDArray, polygon: Float) -> Bool:
 def _cover(material: Material, vertices: Int, problem: ThermalProblem, place: str) -> Cover:
     """A material on vertices (N,); with the skin's ε(θ) and without a sigma of its own, sigma is NaN: the skin's."""
     sigma = MATERIAL_SIGMA if material.sigma_emissivity0 is None else material.sigma_emissivity0
-    cover = Cover(material.name, vertices, None, sigma, "no emissivity is stated", not_skin=material.not_skin)
+    cover = Cover(material.name, vertices, None, sigma, "no emissivity is stated")
+    cover = replace(cover, not_skin=material.not_skin, as_warm=material.counts_as_skin)
     if material.emissivity is None:
         return cover
     try:

@@ -131,7 +131,7 @@ def solve(
     problem = problem.informed(mesh, covers.read(first, problem, calibration, with_uncertainty=False).absolute_K)
     progress("temperature", 3, 4)
     result = covers.read(blend(problem, calibration), problem, calibration)
-    other = other | covers.anywhere
+    other = covers.flagged(other)
     progress("temperature", 4, 4)
     body_fraction = None if problem.around is None else problem.around.body_fraction
     shown = _mesh(mesh, result, calibration, _cavity(problem), problem.room, other)

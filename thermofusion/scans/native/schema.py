@@ -199,6 +199,7 @@ class MaterialDoc(Border):
     emissivity: EmissivitySection | Literal["skin"] | None = None
     sigma_emissivity0: float | None = Field(None, ge=0.001, le=0.5)
     not_skin: bool = False
+    counts_as_skin: bool = False
     polygons: list[OutlineDoc] = Field(default_factory=list, max_length=1000)
     vertices: list[FrameIndex] = Field(default_factory=list, max_length=MAX_VERTICES)
     of_vertices: int = Field(0, ge=0, le=MAX_VERTICES)
@@ -408,7 +409,7 @@ def material_of(doc: MaterialDoc, key: str, thermal: Camera | None, path: Path) 
     if of_vertices and vertices.max(initial=0) >= of_vertices:
         raise ScanError(f"key '{key}.vertices': {vertices.max()} is none of {of_vertices} vertices", place=path)
     where = tuple(polygons), vertices.astype(np.int32), of_vertices
-    return Material(doc.name, emissivity, doc.sigma_emissivity0, doc.not_skin, *where)
+    return Material(doc.name, emissivity, doc.sigma_emissivity0, doc.not_skin, doc.counts_as_skin, *where)
 
 
 def unknown_keys(doc: BaseModel, prefix: str = "") -> list[str]:

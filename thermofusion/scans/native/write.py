@@ -143,7 +143,7 @@ def _material(m: Material) -> dict[str, Any]:
         "name": m.name,
         **({} if m.emissivity is None else {"emissivity": m.emissivity}),
         **({} if m.sigma_emissivity0 is None else {"sigma_emissivity0": m.sigma_emissivity0}),
-        **({"not_skin": True} if m.not_skin else {}),
+        **{key: True for key in ("not_skin", "counts_as_skin") if getattr(m, key)},
         **({"polygons": polygons} if polygons else {}),
         **({"vertices": m.vertices.tolist()} if len(m.vertices) else {}),
         **({"of_vertices": m.of_vertices} if m.of_vertices else {}),
