@@ -182,6 +182,13 @@ def test_measure_writes_csv_and_json(tmp_path):
     assert lines[0].startswith("name,kind,value_degC,sigma_K")
     assert lines[1].startswith("'=1+1,spot,33")
     assert len(lines) == 4
+    more = ["measure", str(tmp_path), "--regions", str(regions), "--before", str(tmp_path), "--vertex", "7", "--json"]
+    document = json.loads(CliRunner().invoke(app, more).stdout)
+    assert [c["delta_K"] for c in document["changes"]] == [0, 0]
+    assert [c["sigma_K"] for c in document["changes"]] == [None, None]  # of a relative result
+    assert document["regions"][2]["name"] == "vertex 7"
+    assert document["regions"][2]["value_degC"] == pytest.approx(float(T[7]))
+    assert CliRunner().invoke(app, ["measure", str(tmp_path)]).exit_code == 2
 
 
 def test_a_closed_surface_keeps_volume_and_area_and_has_a_temperature_everywhere(tmp_path):

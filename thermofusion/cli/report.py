@@ -54,21 +54,32 @@ def view(result: Folder, json: Json = False) -> None:
 
 def measure(
     result: Folder,
-    regions: Annotated[Path, typer.Option("--regions", help="Regions JSON, as the report saves it.")],
+    regions: Annotated[Path | None, typer.Option("--regions", help="Regions JSON, as the report saves it.")] = None,
+    vertex: Annotated[list[int] | None, typer.Option("--vertex", help="Number of a vertex; may be repeated.")] = None,
+    before: Annotated[
+        Path | None, typer.Option("--before", help="Result of an earlier visit: how each region changed since.")
+    ] = None,
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="Stem of the files; regions in the result.", callback=named)
     ] = None,
     json: Json = False,
 ) -> None:
-    """What regions of interest read: mean, its uncertainty, area, left against right; as CSV and JSON."""
+    """What regions of interest read: mean, its uncertainty, area, left against right, change; as CSV and JSON."""
+    from ..errors import RecipeError
     from ..files.json import to_json
     from ..files.whole import write_text
     from ..regions import Measured, Measurer, read_regions
     from ..results.folder import load_temperature
 
-    drawn = read_regions(regions)
+    if regions is None and not vertex:
+        raise RecipeError("nothing to measure", hint="give --regions FILE, or --vertex NUMBER")
+    drawn = [] if regions is None else read_regions(regions)
     temperature = load_temperature(result)
     measured = Measured.of(Measurer(temperature.mesh, temperature.shared, temperature.inputs), drawn)
+    if before is not None:
+        then = load_temperature(before)
+        earlier = Measured.of(Measurer(then.mesh, then.shared, then.inputs), drawn)
+        measured = measured.since(earlier, temperature.inputs)
     stem = out or result / "regions"
     files = {".csv": measured.csv(), "-budget.csv": measured.budget_csv(), ".json": to_json(measured.document()) + "\n"}
     for suffix, text in files.items():

@@ -89,15 +89,20 @@ def between_visits(
     for name in dict.fromkeys([*one, *other]):
         a, b = one.get(name, 0.0), other.get(name, 0.0)
         names.append(name)
-        effects.append(a - b if name.split()[0] in SAME_AT_EACH_VISIT else float(np.hypot(a, b)))
+        effects.append(a - b if cause_of(name) in SAME_AT_EACH_VISIT else float(np.hypot(a, b)))
     return UncertaintyBudget.of(quantity, _by_cause(own, tuple(names), np.array(effects)), inputs)
 
 
+def cause_of(name: str) -> str:
+    """The input that a shared error belongs to: "calibration 3" is one of the errors of "calibration"."""
+    return name.split()[0]
+
+
 def _by_cause(own_K: Mapping[str, float], names: Sequence[str], effects_K: np.ndarray) -> dict[str, float]:
-    """Contributions by cause, K: "calibration 3" is one of the errors of "calibration"; effects_K (R,)."""
+    """Contributions by cause, K; effects_K (R,)."""
     out = {k: v for k, v in own_K.items() if v > 0}
     for name, effect in zip(names, effects_K.tolist(), strict=True):
         if abs(effect) > LEAST_K:
-            cause = name.split()[0]
+            cause = cause_of(name)
             out[cause] = float(np.hypot(out.get(cause, 0.0), effect))
     return out

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from csv import writer
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from io import StringIO
 from itertools import pairwise
@@ -14,12 +14,13 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import RecipeError
 from ..files.table import inert
 from ..types import Bool, BudgetInput, Float, SharedErrors, ThermalMesh, VertexFlag
 from ..version import __version__
 from .body import Body, along
-from .budget import BudgetRow, UncertaintyBudget, of_difference, of_mean
-from .errors import MeanErrors, VertexErrors
+from .budget import BudgetRow, UncertaintyBudget, between_visits, cause_of, of_difference, of_mean
+from .errors import DERIVED, MeanErrors, VertexErrors
 from .patch import Patch, patch_of
 from .region import Line, Region, Slab, Spot, opposite
 from .volume import slab_volume, swelling_volume
@@ -88,14 +89,33 @@ class Measured:
     readings: tuple[Reading, ...]
     differences: tuple[Difference, ...]
     budgets: tuple[UncertaintyBudget, ...] = ()
+    changes: tuple[Difference, ...] = ()
 
     @classmethod
-    def of(cls, measurer: Measurer, regions: Sequence[Region]) -> Measured:
-        """Read every region, then compare."""
+    def of(cls, measurer: Measurer, regions: Sequence[Region], vertices: Sequence[int] = ()) -> Measured:
+        """Read every region and every vertex of these numbers, then compare the regions."""
         readings = [measurer.read(region) for region in regions]
         differences = tuple(measurer.differences(regions, readings))
+        readings += [measurer.vertex(number) for number in vertices]
         budgets = [measurer.budget(reading) for reading in readings] + [d.budget for d in differences]
         return cls(tuple(readings), differences, tuple(b for b in budgets if b is not None))
+
+    def since(self, before: Measured, inputs: Sequence[BudgetInput]) -> Measured:
+        """With how each region changed since an earlier visit; before : the same regions there, one by one. inputs : of
+        this visit's budget.
+
+        Where either level is unknown (a relative result) a change has no sigma and no budget.
+        """
+        changes = []
+        for now, then in zip(self.readings, before.readings, strict=False):  # vertices, which come last, have no before
+            name, budget = f"{now.name}, change", None
+            if now.errors and then.errors and np.isfinite(now.sigma_absolute_K + then.sigma_absolute_K):
+                budget = between_visits(name, now.errors, then.errors, inputs)
+            sigma = NAN if budget is None else budget.combined_K
+            delta = now.value_degC - then.value_degC
+            changes.append(Difference(now.name, f"{then.name}, before", delta, sigma, budget=budget))
+        budgets = tuple(c.budget for c in changes if c.budget is not None)
+        return replace(self, changes=tuple(changes), budgets=self.budgets + budgets)
 
     @property
     def table(self) -> Any:
@@ -118,15 +138,17 @@ class Measured:
             **told,
             "regions": readings,
             "differences": [d.row() for d in self.differences],
+            "changes": [d.row() for d in self.changes],
             "budgets": [b.document() for b in self.budgets],
         }
 
     def csv(self) -> str:
-        """One line a region, then one a difference; an empty cell is not measured or does not apply."""
+        """One line a region, then a difference, then a change since the visit before; an empty cell is not measured."""
         keys = list(Reading("", "").row())
         lines = [keys, *(list(r.row().values()) for r in self.readings)]
-        for d in self.differences:
-            row: dict[str, Any] = dict.fromkeys(keys, "") | {"name": f"{d.first} - {d.second}", "kind": "difference_K"}
+        kinds = [(d, "difference_K") for d in self.differences] + [(d, "change_K") for d in self.changes]
+        for d, kind in kinds:
+            row: dict[str, Any] = dict.fromkeys(keys, "") | {"name": f"{d.first} - {d.second}", "kind": kind}
             row |= {"value_degC": d.delta_K, "sigma_K": d.sigma_K, "length_mm": d.distance_mm}
             lines.append(list(row.values()))
         text = StringIO()
@@ -198,7 +220,27 @@ class Measurer:
         sd = float(np.sqrt(weight @ (T - mean) ** 2 / weight.sum()))
         found = {"sd_K": sd, "min_degC": T.min(), "max_degC": T.max(), "n": int(patch.inside.sum())}
         found |= {"measured_fraction": area / patch.area_m2}
-        return self._reading(region, mean, self.errors.of_area(patch, area), **size, **found)
+        return self._reading(region.name, region.kind, mean, self.errors.of_area(patch, area), **size, **found)
+
+    def vertex(self, number: int) -> Reading:
+        """What one vertex of the mesh reads, its errors by every part of its sigma. Raises RecipeError: no such vertex.
+
+        A spot is a mean of three vertices, and its parts are gathered; here they stand as the mesh has them.
+        """
+        if not 0 <= number < len(self.mesh):
+            raise RecipeError(f"there is no vertex {number}", hint=f"this result has {len(self.mesh)}, from 0")
+        errors = self.errors
+        causes = [cause_of(name) for name in errors.names]
+        parts = {k: float(np.nan_to_num(v[number])) for k, v in self.mesh.uncertainty_parts.items() if k not in DERIVED}
+        own = {k: v for k, v in parts.items() if k not in causes} or {"other": float(self.mesh.uncertainty_K[number])}
+        common = errors.common_K[number].astype(np.float64)
+        off = common - errors.level_K
+        for cause in set(causes) & set(parts):  # signed effects are stored in coarse steps, the parts are not
+            mine = np.array([c == cause for c in causes])
+            size = float(np.linalg.norm(off[mine]))
+            off[mine] *= parts[cause] / size if size else 0.0
+        found = MeanErrors(own, off, common, errors.names)
+        return self._reading(f"vertex {number}", "vertex", float(self._T[number]), found, n=1)
 
     def budget(self, reading: Reading) -> UncertaintyBudget | None:
         """Of a reading on an absolute scale, else about the level common to the body; None = nothing measured."""
@@ -229,7 +271,7 @@ class Measurer:
     def _spot(self, region: Spot) -> Reading:
         _, corners, weights = self.body.nearest(np.array([region.point_m]))
         spot = Patch(corners[0], weights[0], np.ones(3, bool), 0.0)
-        return self._reading(region, float(spot.mean(self._T)), self.errors.of_area(spot, 0.0), n=1)
+        return self._reading(region.name, region.kind, float(spot.mean(self._T)), self.errors.of_area(spot, 0.0), n=1)
 
     def _line(self, region: Line) -> Reading:
         ends = pairwise(np.array(region.points_m))
@@ -250,9 +292,10 @@ class Measurer:
         way = Patch(corners[known].ravel(), weights[known].ravel(), np.ones(3 * int(known.sum()), bool), 0.0)
         found = {"sd_K": T[known].std(), "min_degC": T[known].min(), "max_degC": T[known].max()}
         found |= {"measured_fraction": known.mean(), "n": int(known.sum())}
-        return self._reading(region, float(T[known].mean()), self.errors.of_line(way, length), **size, **found)
+        errors = self.errors.of_line(way, length)
+        return self._reading(region.name, region.kind, float(T[known].mean()), errors, **size, **found)
 
-    def _reading(self, region: Region, value: float, errors: MeanErrors, **rest: Any) -> Reading:
+    def _reading(self, name: str, kind: str, value: float, errors: MeanErrors, **rest: Any) -> Reading:
         absolute = errors.sigma_absolute_K if self.mesh.anchored and np.isfinite(value) else NAN
         sigma = errors.sigma_K if np.isfinite(value) else NAN
-        return Reading(region.name, region.kind, value, sigma, absolute, errors=errors, **rest)
+        return Reading(name, kind, value, sigma, absolute, errors=errors, **rest)
