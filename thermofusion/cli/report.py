@@ -75,7 +75,8 @@ def measure(
         raise RecipeError("nothing to measure", hint="give --regions FILE, or --vertex NUMBER")
     drawn = [] if regions is None else read_regions(regions)
     temperature = load_temperature(result)
-    measured = Measured.of(Measurer(temperature.mesh, temperature.shared, temperature.inputs), drawn)
+    measurer = Measurer(temperature.mesh, temperature.shared, temperature.inputs)
+    measured = Measured.of(measurer, drawn, vertex or ())
     if before is not None:
         then = load_temperature(before)
         earlier = Measured.of(Measurer(then.mesh, then.shared, then.inputs), drawn)
