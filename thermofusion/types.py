@@ -467,7 +467,8 @@ class Observations:
 
     def select(self, mask: NDArray) -> Observations:
         """The rows of a boolean mask (N,) or an index array (M,)."""
-        return Observations(**{k: getattr(self, k)[mask] for k in self.__dataclass_fields__})
+        rows = np.flatnonzero(mask) if mask.dtype == bool else mask  # one look through the mask, not one a column
+        return Observations(**{k: getattr(self, k).take(rows) for k in self.__dataclass_fields__})
 
     __repr__ = brief
 

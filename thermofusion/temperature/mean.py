@@ -45,6 +45,13 @@ class Groups:
     def __len__(self) -> int:
         return len(self.vertex)
 
+    def part(self, first: int, last: int) -> tuple[Groups, slice]:
+        """Groups `first` to `last`, the last excluded, and where their rows stand."""
+        start = self.start[first:last]
+        begin = int(start[0]) if len(start) else 0
+        count = self.count[first:last]
+        return Groups(self.vertex[first:last], start - begin, count), slice(begin, begin + int(count.sum()))
+
     def sums(self, values: NDArray) -> Float:
         """Sum of row values (N,) per group, (G,)."""
         if not len(self):
