@@ -31,6 +31,7 @@ from ..robust import MAD_PER_SIGMA, NORMAL_95
 from ..types import Bool, Float, Float32, Observations, brief
 from .hidden import with_pattern
 from .layout import Layout
+from .mean import Groups
 from .problem import ThermalProblem
 from .references import ContactReading, ExpectedReading
 from .sensor.field import ImageField
@@ -211,7 +212,8 @@ def _settled(problem: ThermalProblem) -> tuple[OverlapSystem, Solution, Observat
 
 
 def _choose(observations: Observations, problem: ThermalProblem) -> Observations:
-    """Observations under the angle limit of vertices that two or more views saw, drawn evenly over the surface.
+    """Observations under the angle limit of vertices that two or more views saw, drawn evenly over the surface; by
+    vertex.
 
     Drawn by place, not by number: the same surface gives the same sample, in whatever order its vertices stand.
     """
@@ -231,16 +233,17 @@ def _choose(observations: Observations, problem: ThermalProblem) -> Observations
     wanted[shared[along_curve(problem.points_m[shared], CURVE_M)[even]]] = True
     for contact in problem.contacts:
         wanted[contact.vertices] = True
-    return observations.select(usable & wanted[observations.vertex])
+    rows = np.flatnonzero(usable & wanted[observations.vertex])
+    return observations.select(rows[Groups.by_vertex(observations.vertex[rows], len(problem))[1]])
 
 
 def _system(rows: Observations, problem: ThermalProblem) -> OverlapSystem:
     """The least squares system of chosen rows."""
     errors, settings, blackbodies = problem.errors, problem.settings.crosscal, problem.blackbodies
     L_r, image_size = problem.L_reflected, (problem.lens.width_px, problem.lens.height_px)
-    numbers, vertex = np.unique(rows.vertex, return_inverse=True)
-    order = np.argsort(vertex, kind="stable").astype(np.int32)
-    count = np.bincount(vertex)
+    count = np.bincount(rows.vertex)
+    numbers = np.flatnonzero(count)
+    vertex, count = (np.cumsum(count > 0) - 1)[rows.vertex], count[numbers]
     L, cos, tables = rows.radiance.astype(np.float64), rows.cos_angle, AngleTables.of(problem.emissivity)
     y = L - L_r[rows.vertex]
     # weights must not depend on the camera's common offset: what references say of it is taken off first
@@ -262,7 +265,7 @@ def _system(rows: Observations, problem: ThermalProblem) -> OverlapSystem:
         sigma2=observation_variance(rows, excess, tables, errors, slope_L).astype(np.float64),
         patterns=field.patterns(rows.u_px, rows.v_px)[:, :K],
         gain_column=L_r[rows.vertex] - pivot if use_gain else np.zeros(len(rows)),
-        order=order,
+        order=np.argsort(vertex, kind="stable").astype(np.int32),
         start=np.insert(np.cumsum(count), 0, 0).astype(np.int32),
         n_groups=problem.n_views if settings.offsets else 1,
         field=field,

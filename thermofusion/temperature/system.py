@@ -18,10 +18,12 @@ from ..physics.equation import excess_reading
 from ..robust import HUBER, MAD_PER_SIGMA, TUKEY, huber_weight, tukey_weight
 from ..types import Bool, Float, Int
 from .layout import Layout
+from .mean import Groups
 from .references import ExpectedReading
 from .sensor.field import ImageField
 
 HUBER_STEPS, TUKEY_STEPS = 4, 40
+SQUARE_ROWS = 2048  # that are multiplied at once
 COARSE_VERTICES = 5000  # enough for a first estimate
 CONVERGED_K = 1e-4  # a hundredth of what any result is good to
 SENSOR_CONVERGED_K = 2e-3  # of a single pixel's or column's part: a vertex's mean knows a tenth of it
@@ -262,7 +264,8 @@ class OverlapSystem:
         """Weighted median of x per vertex, all else given."""
         E = self.E + p[self.layout.shape] * self.D
         value = (self.y - self.predict(p, 0.0)) / E
-        order = np.lexsort((value, self.vertex))
+        by_value = np.argsort(value)
+        order = by_value[Groups.by_vertex(self.vertex[by_value], self.n_vertices)[1]]
         w = np.cumsum((E / self.sigma2)[order])
         total = w[self.start[1:] - 1]
         begin = np.insert(total[:-1], 0, 0.0)
@@ -295,31 +298,27 @@ class OverlapSystem:
         B[:, at.offsets] = csr_matrix(to_group, shape=(len(a), M)).toarray()
         B[:, at.shared] = by_vertex @ G
 
-        wG = w[:, None] * G
-        by_group = csr_matrix((np.ones(len(w)), self.group, np.arange(len(w) + 1)), shape=(len(w), M)).T
+        by_group = csr_matrix((w, self.group, np.arange(len(w) + 1)), shape=(len(w), M)).T
         N, rhs = np.zeros((P, P)), np.empty(P)
-        N[np.arange(M), np.arange(M)] = by_group @ w
-        N[at.offsets, at.shared] = by_group @ wG
+        N[np.arange(M), np.arange(M)] = np.bincount(self.group, w, M)
+        N[at.offsets, at.shared] = by_group @ G
         N[at.shared, at.offsets] = N[at.offsets, at.shared].T
-        N[at.shared, at.shared] = G.T @ wG
-        rhs[at.offsets], rhs[at.shared] = by_group @ (w * y), wG.T @ y
+        N[at.shared, at.shared] = _square(G, w)
+        wy = w * y
+        rhs[at.offsets], rhs[at.shared] = np.bincount(self.group, wy, M), wy @ G
 
         if self.sensor_columns is not None:
             X = self.sensor_columns
             wX = X.multiply(w[:, None]).tocsr()
             B[:, at.sensor] = (by_vertex @ X).toarray()
-            N[at.offsets, at.sensor] = (by_group @ wX).toarray()
+            N[at.offsets, at.sensor] = (by_group @ X).toarray()
             N[at.shared, at.sensor] = (wX.T @ G).T
             N[at.sensor, : at.sensor.start] = N[: at.sensor.start, at.sensor].T
             N[at.sensor, at.sensor] = (X.T @ wX).toarray()
             rhs[at.sensor] = wX.T @ y
 
         level = self._level(a, c, B)
-        if self.sensor_columns is None:
-            N -= B.T @ (B / a[:, None])
-        else:  # a product with its own transpose costs half
-            root = B / np.sqrt(a)[:, None]
-            N -= root.T @ root
+        N -= _square(B, 1 / a)
         rhs -= B.T @ (c / a)
         N /= self.correlated
         rhs /= self.correlated
@@ -395,6 +394,15 @@ class OverlapSystem:
             return Level(share @ np.array(rows), float(share @ targets), float(1 / w.sum()))
         M, P = self.layout.n_offsets, self.layout.size
         return Level(np.concatenate([np.full(M, 1 / M), np.zeros(P - M)]), 0.0, 0.0)
+
+
+def _square(columns: Float, weight: Float) -> Float:
+    """Σ weight · row rowᵀ, (P, P), over rows of columns (N, P), weight (N,) ≥ 0; block by block, in the cache."""
+    total, root = np.zeros((columns.shape[1], columns.shape[1])), np.sqrt(weight)
+    for begin in range(0, len(columns), SQUARE_ROWS):
+        part = columns[begin : begin + SQUARE_ROWS] * root[begin : begin + SQUARE_ROWS, None]
+        total += part.T @ part  # a product with its own transpose costs half
+    return total
 
 
 def constrained_minimum(
