@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import ctypes
 import os
 import signal
 import sys
@@ -11,6 +12,9 @@ from contextlib import suppress
 from typing import Any, NoReturn
 
 from .errors import INTERRUPTED, INTERRUPTED_SENTENCE
+
+# M_MMAP_THRESHOLD, M_TRIM_THRESHOLD, M_TOP_PAD in bytes, M_ARENA_MAX of GNU's mallopt (malloc.h)
+KEEP_MEMORY = {-3: 32 << 20, -1: 1 << 30, -2: 64 << 20, -8: 1}
 
 
 def main() -> None:
@@ -28,6 +32,7 @@ def main() -> None:
 
     signal.signal(signal.SIGINT, stop)
     sys.unraisablehook = unraisable
+    _keep_memory()
     try:
         from .cli import main as run
 
@@ -38,6 +43,17 @@ def main() -> None:
         if asked:
             _end()
         raise
+
+
+def _keep_memory() -> None:
+    """Memory that is freed stays, for what comes next, in one pool for all threads.
+
+    Arrays of a few MB come and go by the thousand; given back to the system each time, their pages are cleared again
+    for the next: a twentieth of the CPU time of a run, and a quarter more memory.
+    """
+    with suppress(AttributeError, OSError, TypeError):  # another C library than GNU's
+        for option, value in KEEP_MEMORY.items():
+            ctypes.CDLL(None).mallopt(option, value)
 
 
 def _leave(how: SystemExit) -> NoReturn:
