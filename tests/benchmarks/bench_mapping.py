@@ -45,7 +45,8 @@ start, cpu = time.monotonic(), time.process_time()
 rays = SurfaceRays(mesh)
 observe_views(scan.thermal, rays, views, converter, MappingSection())
 ours_s, ours_cpu_s = time.monotonic() - start, time.process_time() - cpu
-print(f"ours   {len(mesh)} vertices, {n} views: {ours_s:.2f} s, {1e3 * ours_s / n:.1f} ms a view, CPU {ours_cpu_s:.2f} s")
+told = f"{ours_s:.2f} s, {1e3 * ours_s / n:.1f} ms a view, CPU {ours_cpu_s:.2f} s"
+print(f"ours   {len(mesh)} vertices, {n} views: {told}")
 
 if options.open3d:
     target = o3d.t.geometry.TriangleMesh(o3d.core.Tensor(mesh.vertices_m), o3d.core.Tensor(mesh.triangles))
