@@ -17,7 +17,7 @@ from ..recipe import Recipe
 from ..robust import weighted_quantile
 from ..surface.surface import SurfaceResult
 from ..temperature.blend import BlendResult, blend
-from ..temperature.crosscal import Calibration, calibrate
+from ..temperature.crosscal import Calibration, Overlap, calibrate
 from ..temperature.problem import ThermalProblem
 from ..temperature.solve import Temperature
 from ..temperature.uncertainty import BILINEAR_VARIANCE, AngleTables, observation_variance, skin_slope
@@ -80,14 +80,18 @@ class Bench:
     def __len__(self) -> int:
         return len(self.problem)
 
-    def calibrate(self, views: Bool, vertices: Bool | None = None) -> Calibration | None:
+    def calibrate(
+        self, views: Bool, vertices: Bool | None = None, like: Calibration | None = None
+    ) -> Calibration | None:
         """Cross-calibration of the views of a mask (N_views,), from the vertices of a mask (V,) alone if given.
 
-        None for methods without. Raises ScanError.
+        like : whose terms of the sensor's pattern are taken; None: those that these views ask for. None for methods
+        without. Raises ScanError.
         """
         if self.problem.settings.method != "joint":
             return None
-        return calibrate(self.problem.part(views, vertices))
+        problem = self.problem.part(views, vertices)
+        return calibrate(problem) if like is None else Overlap.of(problem).like(like.sensor)
 
     def blend(self, views: Bool, calibration: Calibration | None) -> BlendResult:
         """The map from the views of a mask (N_views,)."""

@@ -181,7 +181,7 @@ def _calibration_error(bench: Bench, calibration: Calibration, place_m: NDArray,
         views = bench.problem.seen_views
         mask = np.ones(bench.problem.n_views, bool)
         mask[views[k % len(views)]] = False
-        own = bench.blend(mask, bench.calibrate(mask))
+        own = bench.blend(mask, bench.calibrate(mask, like=calibration))
         change = own.temperature_K - bench.blend(mask, calibration).temperature_K
         return np.asarray(np.sqrt(len(views) - 1) * change)
 
@@ -191,7 +191,7 @@ def _by_halves(bench: Bench, calibration: Calibration, place_m: NDArray, k: int)
     cube = np.floor(place_m / PATCH_M + 0.5 * k).astype(int).sum(1) % 2 == 0
     change = []
     for mask, skin in zip(_by_turns(bench, k + 1, 0), (cube, ~cube), strict=True):
-        own = bench.blend(mask, bench.calibrate(mask, skin))
+        own = bench.blend(mask, bench.calibrate(mask, skin, calibration))
         change.append(own.temperature_K - bench.blend(mask, calibration).temperature_K)
     return np.asarray(0.5 * (change[0] - change[1]))
 

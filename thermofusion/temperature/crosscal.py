@@ -36,7 +36,7 @@ from .problem import ThermalProblem
 from .references import ContactReading, ExpectedReading
 from .sensor.field import ImageField
 from .sensor.pattern import Pattern
-from .sensor.refine import Refinement, refine
+from .sensor.refine import Refinement, refine, solved_with
 from .system import SHAPE_BOUNDS, ContactRow, KnownField, OverlapSystem, Solution, condition_number
 from .uncertainty import DEFAULT_SIGMA_NORMAL_DEG, AngleTables, covariance_modes, observation_variance, skin_slope
 
@@ -182,6 +182,13 @@ class Overlap:
     def plain(self) -> Calibration:
         """Without a pattern of the sensor."""
         return _result(self, None)
+
+    def like(self, sensor: Pattern | None) -> Calibration:
+        """With the terms of another solution's pattern, whether or not this one would ask for them."""
+        if sensor is None:
+            return self.plain()
+        system, solution, rows, pattern = solved_with(sensor, self.system, self.solution, self.rows)
+        return replace(_result(replace(self, system=system, solution=solution, rows=rows), None), sensor=pattern)
 
     def refined(self) -> Calibration:
         """With the sensor's pattern, where residuals and left-out views ask for one."""

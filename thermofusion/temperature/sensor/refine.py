@@ -98,12 +98,22 @@ def refine(problem: ThermalProblem, system: OverlapSystem, solution: Solution, r
         now = statistics(left_out(system, solution, rows, points), width)
     if not better:
         return Refinement(before, before, {}, None, *whole, floor)
-    system, solution, chosen = whole[0].sample(whole[1], FINAL_SAMPLE)
-    rows = whole[2].select(chosen)
-    system = system.with_sensor(kept, rows.u_px, rows.v_px)
-    solution = system.solve(solution, 2 * SOLVE_STEPS)
-    kept = replace(kept, coefficients=solution.p[system.layout.sensor])
+    system, solution, rows, kept = solved_with(kept, *whole)
     return Refinement(before, now, better, kept, system, solution, rows, floor)
+
+
+def solved_with(
+    pattern: Pattern, system: OverlapSystem, solution: Solution, rows: Observations
+) -> tuple[OverlapSystem, Solution, Observations, Pattern]:
+    """The final solution with terms of a pattern that were decided on; its coefficients are solved for anew.
+
+    system, solution, rows : without a pattern.
+    """
+    system, solution, chosen = system.sample(solution, FINAL_SAMPLE)
+    rows = rows.select(chosen)
+    system = system.with_sensor(pattern, rows.u_px, rows.v_px)
+    solution = system.solve(solution, 2 * SOLVE_STEPS)
+    return system, solution, rows, replace(pattern, coefficients=solution.p[system.layout.sensor])
 
 
 def _beyond_chance(a: Alike, floor_K: float) -> bool:
