@@ -12,9 +12,11 @@ from support.synthetic_views import BAND, L_ROOM, REFLECTED_K, make_world, vigne
 from support.truth import truth_of
 
 from thermofusion.cli import main
+from thermofusion.diagnosis import VOCABULARY
 from thermofusion.errors import RecipeError, ScanError
 from thermofusion.judge.leftout import WELL_SEEN_COS, Bench
-from thermofusion.judge.maperror import map_error
+from thermofusion.judge.limits import LEFT_OUT, SHARED_FAULTS, gain_limit, limits
+from thermofusion.judge.maperror import MapError, map_error
 from thermofusion.judge.validate import validate
 from thermofusion.phantom import load_scene, simulate
 from thermofusion.physics.band import ZERO_DEGC_K
@@ -153,6 +155,19 @@ def test_point_spread_is_found_in_the_map():
     psf_px = np.sqrt((sigma_m / pixel_m) ** 2 - 1 / 6)
     told = map_error(bench, bench, surface_of(world), true_error(world, bench)[1], psf_px)
     assert told.spread_rms_K == pytest.approx(0.5 / np.sqrt(2) * (1 - gain), rel=0.25)
+
+
+def test_where_the_error_cannot_be_told_is_said():
+    error = MapError(Statistics(9, 0, 0.02, 0.03, 0.05, 0.95), Statistics(9, 0, 0, 0, 0, 1), 0, 0, 4, 3, 1, 1, 0.2)
+    assert limits((), error) == ()
+    assert limits([{"what": "dead pixels"}, {"what": "time stamps jitter"}], error) == ()
+    (said,) = limits([{"what": "rows are read one after another"}], error)
+    assert "cannot be told" in said
+    assert set(SHARED_FAULTS) | {LEFT_OUT} <= set(VOCABULARY)
+    assert "70%" in limits((), replace(error, tail_share=0.7))[0]
+    # a map that is stretched by g about its middle errs by g times its spread
+    T = np.array([30.0, 33.0, 34.0, np.nan, 33.0])
+    assert gain_limit(error, T) == pytest.approx(0.2 * 0.02 / np.mean([3, 0, 1, 0]))
 
 
 def test_too_few_views(tmp_path):

@@ -13,6 +13,7 @@ path, ε(0) and reflection. The rest (a wrong shape of the mesh, a wrong sensor 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..errors import ScanError
-from ..robust import Statistics
+from ..robust import Statistics, weighted_quantile
 from ..temperature.blend import BlendResult
 from ..temperature.crosscal import Calibration
 from ..types import Bool, Float, SurfaceMesh
@@ -32,7 +33,9 @@ HALVINGS = 3  # ways to cut the arcs: a weakly determined pattern differs much f
 DECLARED = ("shape", "silhouette", "air", "emissivity0", "reflected")  # parts of the budget that all views share
 OF_VIEWS = ("noise", "normals", "registration", "silhouette")  # parts that more views make smaller
 PATCH_M = 0.15  # skin this far apart errs independently: many windows of normals
+PATTERN_PATCH_M = 0.06  # where the sensor has a pattern: each half of the skin must cross all of its places
 SAMPLING_PX2 = 1 / 6  # variance of bilinear sampling as a point spread, mean over sub-pixel positions
+TAIL = 0.01  # share of the errors whose weight in the mean square is told
 REACH = 2.5  # sigmas to which the point spread is followed
 NEIGHBOURS = 4  # sampled vertices over which the squared effect of the point spread is averaged
 NODES, NODE_WEIGHTS = np.polynomial.hermite_e.hermegauss(7)
@@ -46,6 +49,7 @@ class MapError:
     spread_rms_K : effect of the point spread; declared_rms_K : parts of the budget that all views share.
     arc_views : consecutive views that stay together in a half. coverage : share of that surface which both halves of
     some cut saw; surface that as many views saw represents the rest. sigma_ratio : rms of error over stated sigma.
+    tail_share : of the mean square, that the largest hundredth of the errors carries.
     """
 
     error: Statistics
@@ -56,6 +60,7 @@ class MapError:
     halvings: int
     coverage: float
     sigma_ratio: float
+    tail_share: float = float("nan")
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,18 +71,26 @@ class Halves:
     error_K: Float
 
 
-def map_error(bench: Bench, dense: Bench, surface: SurfaceMesh, sigma_K: NDArray, psf_sigma_px: float) -> MapError:
+def map_error(
+    bench: Bench,
+    dense: Bench,
+    surface: SurfaceMesh,
+    sigma_K: NDArray,
+    psf_sigma_px: float,
+    shared: Sequence[str] = DECLARED,
+) -> MapError:
     """The expected relative error of the map of all views.
 
     Parameters
     ----------
     bench : an even sample of `dense`, all vertices of the surface. sigma_K : (V_dense,) the result's stated sigma.
-    psf_sigma_px : point spread of the thermal image.
+    psf_sigma_px : point spread of the thermal image. shared : parts of the budget that all views have in common.
 
     Raises ScanError where halves of the views cannot be compared.
     """
     count = np.bincount(bench.problem.observations.vertex[bench.problem.counts], minlength=len(bench))
-    wanted = np.flatnonzero(bench.well_seen & (count > 0))
+    other = bench.problem.other
+    wanted = np.flatnonzero(bench.well_seen & (count > 0) & (True if other is None else ~other))
     if not len(wanted):
         raise ScanError("no spot was seen by two views under 60°")
     arc = int(np.clip(np.median(count[wanted]) // 2, 1, len(bench.problem.seen_views) // 2))
@@ -93,7 +106,7 @@ def map_error(bench: Bench, dense: Bench, surface: SurfaceMesh, sigma_K: NDArray
         covered |= np.isfinite(error[wanted])
         random.append(_completed(error[wanted], _own(whole)[wanted], count[wanted]))
 
-    declared = _declared(bench, calibration, whole)[wanted]
+    declared = _declared(bench, calibration, whole, shared)[wanted]
     spread = _point_spread(bench, dense, surface, calibration, cuts[0].masks, psf_sigma_px)[wanted]
     # shared parts are taken as normal, of unknown sign
     error = (np.concatenate(random)[:, None] + np.tile(np.hypot(declared, spread), len(cuts))[:, None] * NODES).ravel()
@@ -109,18 +122,25 @@ def map_error(bench: Bench, dense: Bench, surface: SurfaceMesh, sigma_K: NDArray
         halvings=len(cuts),
         coverage=float(covered.mean()),
         sigma_ratio=float(np.sqrt(np.average((error[known] / sigma[known]) ** 2, weights=weight[known]))),
+        tail_share=_tail_share(error, weight),
     )
 
 
-def _declared(bench: Bench, calibration: Calibration | None, whole: BlendResult) -> Float:
+def _tail_share(error: Float, weight: Float) -> float:
+    """Share of the mean square of errors (N,) of weights (N,) that the largest `TAIL` of them carries."""
+    square, tail = weight * error**2, np.abs(error) > weighted_quantile(np.abs(error), weight, 1 - TAIL)
+    return float(square[tail].sum() / max(square.sum(), 1e-30))
+
+
+def _declared(
+    bench: Bench, calibration: Calibration | None, whole: BlendResult, shared: Sequence[str] = DECLARED
+) -> Float:
     """(V,) K, what the budget holds of errors that all views share.
 
     The fitted shape of ε(θ) is one of them as far as its uncertainty is no matter of noise (normals bend it).
     """
     parts = whole.uncertainty.parts_K
-    squares = sum(
-        (np.nan_to_num(parts[k].astype(np.float64)) ** 2 for k in DECLARED if k in parts), np.zeros(len(bench))
-    )
+    squares = sum((np.nan_to_num(parts[k].astype(np.float64)) ** 2 for k in shared if k in parts), np.zeros(len(bench)))
     if calibration is not None:
         bend = np.sqrt(
             max(
@@ -188,7 +208,8 @@ def _calibration_error(bench: Bench, calibration: Calibration, place_m: NDArray,
 
 def _by_halves(bench: Bench, calibration: Calibration, place_m: NDArray, k: int) -> Float:
     """(V,) K, half the difference of two calibrations from half of the views and of the skin each."""
-    cube = np.floor(place_m / PATCH_M + 0.5 * k).astype(int).sum(1) % 2 == 0
+    side_m = PATCH_M if calibration.sensor is None else PATTERN_PATCH_M
+    cube = np.floor(place_m / side_m + 0.5 * k).astype(int).sum(1) % 2 == 0
     change = []
     for mask, skin in zip(_by_turns(bench, k + 1, 0), (cube, ~cube), strict=True):
         own = bench.blend(mask, bench.calibrate(mask, skin, calibration))

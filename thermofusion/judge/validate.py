@@ -25,7 +25,8 @@ from ..temperature.uncertainty import BILINEAR_VARIANCE
 from ..types import Scan
 from ..version import __version__
 from .leftout import WELL_SEEN_DEG, Bench, LeftOut
-from .maperror import MapError, map_error
+from .limits import gain_limit, limits
+from .maperror import DECLARED, MapError, map_error
 
 if TYPE_CHECKING:
     from ..pipeline import Result
@@ -56,7 +57,8 @@ class MotionVerdict:
 class ValidationReport:
     """What `validate` found. by_angle : left-out readings by viewing angle, keys like "0-20". noise_K : of one sampled
     reading; beyond_noise_K : robust RMS of left-out residuals under 60° less that noise.
-    map_error, motion : None where they cannot be had; messages say why.
+    map_error, motion : None where they cannot be had; messages say why. gain_limit : share by which the camera's gain
+    may be off before the map's expected MAE is a fifth too small.
     """
 
     scan: str
@@ -72,6 +74,7 @@ class ValidationReport:
     map_error: MapError | None
     motion: MotionVerdict | None = None
     messages: tuple[str, ...] = ()
+    gain_limit: float = float("nan")
 
     def document(self) -> dict[str, Any]:
         """The content of `validation.json`."""
@@ -93,6 +96,10 @@ class ValidationReport:
         ]
         lines.append(f"             pixel noise {self.noise_K:.4f} K; beyond it {self.beyond_noise_K:.4f} K under 60°")
         lines += [] if self.map_error is None else _map_lines(self.map_error)
+        if np.isfinite(self.gain_limit):
+            lines.append(
+                f"             a gain off by more than {self.gain_limit:.1%} makes it larger by a fifth, unseen"
+            )
         lines += [] if self.motion is None else [f"motion       {self.motion.text()}"]
         return "\n".join([*lines, *(f"note         {m}" for m in self.messages)])
 
@@ -169,11 +176,16 @@ def validate_result(
     error = None
     step("half maps", 0, 1)
     try:
-        error = map_error(bench, dense, mesh.surface, mesh.uncertainty_K, psf_px)
+        shared = (*DECLARED, *(("scale",) if result.mapped.depth_scale else ()))
+        error = map_error(bench, dense, mesh.surface, mesh.uncertainty_K, psf_px, shared)
+        notes += limits(result.report.get("diagnosis", ()), error)
     except ScanError as fault:
         notes.append(f"the map's own error cannot be told from halves of the views: {fault.cause}")
     step("half maps", 1, 1)
     report = _report(scan, bench, left, folds, error, tuple(notes), recipe.name)
+    solved = result.temperature.calibration
+    if error is not None and solved is not None and solved.gain == 1:
+        report = replace(report, gain_limit=gain_limit(error, mesh.temperature_degC))
     return _with_motion(scan, result, report, recipe, folds, step) if motion else report
 
 
