@@ -19,6 +19,7 @@ from ..physics.band import ZERO_DEGC_K, Band
 from ..physics.emissivity import EmissivityModel, follows_shape
 from ..physics.equation import paper_chain, surface_radiance
 from ..recipe import TemperatureSection
+from ..robust import median
 from ..types import Bool, Float, Float32, Int, Observations, OutputMode
 from .crosscal import Calibration
 from .mean import Groups, RobustMean, Solved
@@ -146,7 +147,7 @@ class _Task:
             settings=settings,
             slope_L=calibration.slope_L if calibration else skin_slope(problem.band, rows.radiance),
             paper_S=_paper_scale(rows, given, problem.band, problem.room) if settings.method == "paper" else 1.0,
-            distance_m=float(np.median(rows.range_m)) if len(rows) else 0.0,
+            distance_m=median(rows.range_m) if len(rows) else 0.0,
             middle_m=middle_m,
             body_m=float(np.sqrt(((problem.points_m - middle_m) ** 2).sum(1).mean())),
             registration_over=problem.errors.registration_over,

@@ -27,7 +27,7 @@ from ..errors import ScanError
 from ..geometry.patches import along_curve
 from ..physics.emissivity import AngleTable, EmissivityModel, reshaped, shape_direction
 from ..physics.equation import without_gain
-from ..robust import MAD_PER_SIGMA, NORMAL_95
+from ..robust import MAD_PER_SIGMA, NORMAL_95, median
 from ..types import Bool, Float, Float32, Observations, brief
 from .hidden import with_pattern
 from .layout import Layout
@@ -479,10 +479,11 @@ def _sigma_normal_deg(rows: Observations, system: OverlapSystem, solution: Solut
         return problem.errors.sigma_normal_deg
     square = (system.y - system.predict(solution.p, solution.x))[good] ** 2 * (n / (n - 1))[good]
     lever2 = lever[good] ** 2
-    edges = np.quantile(lever2, np.linspace(0, 1, 11))
-    number = np.clip(np.searchsorted(edges, lever2) - 1, 0, 9)
-    rise = [np.median(lever2[number == k]) for k in range(10)]
-    variance = [np.median(square[number == k]) / MAD_PER_SIGMA**2 for k in range(10)]
+    order = np.argsort(lever2)
+    lever2, square = lever2[order], square[order]
+    edges = np.searchsorted(lever2, np.quantile(lever2, np.linspace(0, 1, 11)[1:-1]), side="right")
+    rise = [median(of_class) for of_class in np.split(lever2, edges)]
+    variance = [median(of_class) / MAD_PER_SIGMA**2 for of_class in np.split(square, edges)]
     slope = float(np.polyfit(rise, variance, 1)[0])
     return float(np.clip(NORMALS_HIDDEN * np.degrees(np.sqrt(max(slope, 0.0))), *NORMALS_BOUNDS_DEG))
 

@@ -14,6 +14,7 @@ from ..mapping.observe import Mapped, clear_of_silhouettes
 from ..physics.band import Band
 from ..physics.emissivity import EmissivityModel, model_from_recipe
 from ..recipe import MappingSection, TemperatureSection
+from ..robust import median
 from ..types import Bool, Camera, Float, Float32, Int, LensScatter, Observations, Scan, SurfaceMesh, ThermalViews
 from .references import ContactReading, ExpectedReading, contact_readings, expected_readings
 from .room.changing import Changing
@@ -135,7 +136,7 @@ class ThermalProblem:
             transfer=transfer,
             changing=changing,
         )
-        return problem.lit_by(np.full(len(surface), np.median(rows.radiance), np.float32))
+        return problem.lit_by(np.full(len(surface), median(rows.radiance), np.float32))
 
     def __len__(self) -> int:
         return len(self.vertices)

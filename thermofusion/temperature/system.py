@@ -15,7 +15,7 @@ from scipy.linalg import solve
 from scipy.sparse import csr_matrix
 
 from ..physics.equation import excess_reading
-from ..robust import HUBER, MAD_PER_SIGMA, TUKEY, huber_weight, tukey_weight
+from ..robust import HUBER, MAD_PER_SIGMA, TUKEY, huber_weight, median, tukey_weight
 from ..types import Bool, Float, Int
 from .layout import Layout
 from .mean import Groups
@@ -255,7 +255,7 @@ class OverlapSystem:
         """Weights 1/σ² times the robust factor, and the scale of standardised residuals."""
         r = np.abs(self.y - self.predict(p, x)) / np.sqrt(self.sigma2)
         freedom = max(len(r) - len(x), len(r) // 4, 1)
-        scale = max(float(np.median(r)) / MAD_PER_SIGMA * np.sqrt(len(r) / freedom), 1e-3)
+        scale = max(median(r) / MAD_PER_SIGMA * np.sqrt(len(r) / freedom), 1e-3)
         t = r / (scale * (HUBER if huber else TUKEY))
         factor = huber_weight(t) if huber else tukey_weight(t)
         return factor / self.sigma2, scale

@@ -15,6 +15,7 @@ from scipy.special import erfc
 from ..physics.band import Band
 from ..physics.emissivity import AngleTable, EmissivityModel
 from ..recipe import TemperatureSection
+from ..robust import median
 from ..types import Float, Float32, Observations, ThermalCamera
 
 DEFAULT_SIGMA_NORMAL_DEG = 2.0  # of normals over a 25 mm window of a Kinect's surface
@@ -192,7 +193,7 @@ class Uncertainty:
         level: dict[str, float] = {}
         for name, effect in common.items():
             cause, known = cause_of(name), effect[np.isfinite(effect)]
-            middle = float(np.median(known)) if len(known) else 0.0
+            middle = median(known) if len(known) else 0.0
             level[cause] = float(np.hypot(level.get(cause, 0.0), middle))
             if len(known) and np.ptp(known) > 0:
                 off = np.abs(effect - np.float32(middle))
