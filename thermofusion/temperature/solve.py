@@ -35,6 +35,7 @@ from .inputs import inputs_of
 from .materials import Covers
 from .passed_over import contradicted, doubtful_with_neighbours
 from .problem import ThermalProblem
+from .room.answer import operator_answered
 from .room.map import RoomMap
 from .room.stated import Room
 from .room.survey import survey
@@ -197,6 +198,8 @@ def calibrated(
     calibration = overlap.refined()
     if other.any() or calibration.sensor is not None:  # else the plain one says the same
         first = blend(problem, calibration, with_uncertainty=False)
+    if problem.settings.sigma_operator_m2:
+        problem = replace(problem, effects={**problem.effects, "operator": operator_answered(overlap, first)})
     doubts: tuple[str, ...] = ()
     if doubted:
         text = f"{doubted:.0%} of the surface do not behave as skin: none is flagged, the model of ε(θ) may be wrong"
