@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.problems import LENS, errors, problem_of
 from support.synthetic_views import BAND, HEIGHT, L_ROOM, REFLECTED_K, WIDTH, fibonacci_sphere, make_world
+from test_crosscal import blackbodies
 from test_surroundings import sphere_part
 
 from thermofusion.diagnosis.radiation import of_room
@@ -17,6 +18,8 @@ from thermofusion.physics.emissivity import Fresnel
 from thermofusion.physics.scatter import WIDTHS
 from thermofusion.physics.signal import SignalConverter
 from thermofusion.temperature import crosscal
+from thermofusion.temperature.blend import blend
+from thermofusion.temperature.room.answer import operator_answered
 from thermofusion.temperature.room.harmonics import open_transfer
 from thermofusion.temperature.room.map import RoomMap, RoomPrior
 from thermofusion.temperature.room.operator import operator_effect, operator_excess, without_operator
@@ -26,6 +29,7 @@ from thermofusion.temperature.room.witness import sides_of
 from thermofusion.types import BlackbodyReference, ThermalCamera, ThermalStream, ThermalViews
 
 SLOPE = float(BAND.d_radiance_dT(REFLECTED_K))
+SLOPE_SKIN = float(BAND.d_radiance_dT(273.15 + 32.5))
 DIPOLE_K = np.array([2.0, -1.0, 0.8])  # warmer towards +x, -y, +z
 PRIOR = RoomPrior(L_ROOM, SLOPE, sigma_K=0.5, dipole_K=2.0)
 
@@ -223,3 +227,25 @@ def test_the_operator_is_taken_off_in_closed_form():
     seen = np.bincount(rows.vertex[rows.cos_angle > 0.5], minlength=500) > 0
     assert (effect[seen] > 0).all()
     assert (effect[~seen] == 0).all()
+
+
+def test_an_operator_is_followed_through_the_calibration_as_solving_again_says():
+    """Views on one side stand near: what is taken off again is not what was added, and places differ."""
+    world = make_world(4, n_views=30)
+    near = world.observations.view < 12
+    rows = replace(world.observations, range_m=np.where(near, 0.6, 1.3).astype(np.float32))
+    problem = problem_of(rows, world.n_vertices, world.n_views, blackbodies=tuple(blackbodies(world)))
+    overlap = crosscal.Overlap.of(problem)
+    first = blend(problem, overlap.plain(), with_uncertainty=False)
+    told = operator_answered(overlap, first) / (SLOPE_SKIN * problem.emissivity.normal)
+    excess = problem.settings.sigma_operator_m2 * operator_excess(rows, problem.emissivity, BAND, REFLECTED_K)
+    warmed = replace(problem, observations=replace(rows, radiance=rows.radiance + excess))
+    again = blend(warmed, crosscal.Overlap.of(warmed).plain(), with_uncertainty=False)
+    change = again.absolute_K - first.absolute_K
+    seen = np.isfinite(change) & (first.best_angle_deg < 60)
+    left = np.std((change - told)[seen])
+    assert abs(np.median((change - told)[seen])) < 0.05 * np.median(change[seen])
+    assert left < 0.6 * np.std(change[seen])  # the rest: robust weights that change
+    alone = operator_effect(rows, excess, np.ones(len(rows), bool), world.n_vertices) / SLOPE_SKIN
+    assert np.std((change - alone)[seen]) > 5 * left  # what the excess by itself would have said
+    assert abs(np.median((change - alone)[seen])) > 0.5 * np.median(change[seen])
