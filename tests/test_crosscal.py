@@ -166,6 +166,13 @@ def test_gain_is_carried_by_two_references_only():
     assert c.gain == pytest.approx(gain, abs=0.003)
     error = temperatures(world, c, observations=obs).absolute_K - world.T_K
     assert abs(np.nanmedian(error)) < 0.05
+    told, sigma = calibrate(world, observations=obs, blackbodies=readings).criticism["gain"]  # without solving for it
+    assert told == pytest.approx(gain - 1, abs=0.003)
+    assert sigma < 0.004
+    right = [replace(r, measured=r.expected + world.slope_L * world.offsets_K[r.view]) for r in readings]
+    told, sigma = calibrate(world, blackbodies=right).criticism["gain"]
+    assert abs(told) < 2.5 * sigma < 0.01
+    assert calibrate(world, observations=obs, blackbodies=readings[:3]).criticism["gain"] is None
     one = calibrate(world, observations=obs, blackbodies=readings[:3], settings=settings)
     assert one.gain == 1.0
     assert "gain" in one.held

@@ -9,6 +9,7 @@ import pytest
 from support.problems import errors, problem_of
 from support.synthetic_views import BAND, WIDTH, make_world
 
+from thermofusion.diagnosis.diagnose import _references
 from thermofusion.mapping.pixels import bad_pixels
 from thermofusion.physics.signal import SignalConverter
 from thermofusion.scans.check import _automatic_gain
@@ -44,6 +45,15 @@ def test_columns_of_the_sensor_are_found_and_their_size_told():
     true_K = column_K[60 : WIDTH - 60]
     left = (found_K - found_K.mean()) - (true_K - true_K.mean())
     assert np.std(left) < 0.4 * np.std(true_K)
+
+
+def test_a_gain_that_references_contradict_is_named_instead_of_their_scatter():
+    _, c = solved(make_world(3, n_vertices=1000, n_views=12))
+    named = lambda **told: [(d.what, d.size, d.size_K) for d in _references(replace(c, criticism=told))]  # noqa: E731
+    assert named(gain=(-0.02, 0.004), references_K=0.1) == [("gain is off", 2.0, None)]
+    assert named(gain=(0.02, 0.007), references_K=0.0) == []
+    assert named(gain=(0.004, 0.0005), references_K=0.0) == []
+    assert named(gain=None, references_K=0.1) == [("references contradict each other", None, 0.1)]
 
 
 def test_hats_and_lines_are_partitions_of_one():

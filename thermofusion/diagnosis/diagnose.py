@@ -15,6 +15,7 @@ from .radiation import of_lens, of_room
 from .words import VOCABULARY, Diagnosis
 
 OUTLINE_PX = 0.4  # clean scans leave 0.15-0.3 px between the outlines of model and image
+GAIN_SIGMAS, LEAST_GAIN = 3.5, 0.005  # by which references must contradict the gain, and a share that is worth a word
 GRID = 24  # points along each side of the image at which a pattern's size is taken
 
 
@@ -104,6 +105,15 @@ def _patterns(c: Calibration) -> list[Diagnosis]:
 
 
 def _references(c: Calibration) -> list[Diagnosis]:
+    """A gain that two references contradict; else their scatter."""
+    gain, sigma = c.criticism.get("gain") or (0.0, 1.0)
+    if abs(gain) > max(GAIN_SIGMAS * sigma, LEAST_GAIN):
+        side = "large" if gain > 0 else "small"
+        text = f"references at unlike temperatures read as if the gain were {abs(gain):.1%} ± {sigma:.1%} too {side}"
+        solved = c.gain != 1
+        done = "solved for" if solved else "left as it is; sigma holds the recipe's temperature.sigma_gain"
+        size = 100 * abs(gain)
+        return [Diagnosis("gain is off", text, None, "everywhere, away from the level", done, size=size, unit="%")]
     scatter = c.criticism.get("references_K")
     if not scatter:
         return []

@@ -25,6 +25,7 @@ VOCABULARY = MappingProxyType(
         "lines of recorded poses missing": "let the tracking write a line for every depth frame, or mark those it lost",
         "lines of recorded poses too many": "let the tracking write one line for every depth frame",
         "recorded poses do not fit the depth": "set tracking.refine to true, or tracking.source to estimate",
+        "gain is off": "set temperature.crosscal.gain to true, and have the camera calibrated",
         "references contradict each other": "let references and camera warm up, and show them in more frames",
     }
 )

@@ -29,6 +29,7 @@ from ..physics.emissivity import AngleTable, EmissivityModel, reshaped, shape_di
 from ..physics.equation import without_gain
 from ..robust import MAD_PER_SIGMA, NORMAL_95, median
 from ..types import Bool, Float, Float32, Observations, brief
+from .gain import GAIN_SPAN_K, gain_of_readings
 from .hidden import with_pattern
 from .layout import Layout
 from .mean import Groups
@@ -42,7 +43,6 @@ from .uncertainty import DEFAULT_SIGMA_NORMAL_DEG, AngleTables, covariance_modes
 
 FIELD_HELD = 0.7  # of the prior's sigma: a pattern of the field less certain than this is held at zero
 SHAPE_HELD = 0.5  # a shape less certain than half the way between the skin presets is held
-GAIN_SPAN_K = 3.0  # references must differ by this much to carry a gain
 ROWS_PER_VERTEX = 20  # bound on the system: max_vertices x this many observations
 SUPPORT_CELLS = 24  # across the image; the field is known in those that hold so many rows of so many views
 SUPPORT_ROWS, SUPPORT_VIEWS = 25, 3
@@ -490,7 +490,7 @@ def _sigma_normal_deg(rows: Observations, system: OverlapSystem, solution: Solut
 
 def _told(r: Refinement, system: OverlapSystem, solution: Solution) -> dict[str, Any]:
     """Criticism for the report: agreement of residuals by coordinate, without and with the sensor's pattern, [K, z];
-    references_K : scatter of references' readings where it is no chance."""
+    references_K : scatter of references' readings where it is no chance; gain : [γ, sigma] where references tell it."""
     chi2, freedom, weight = _readings_scatter(system, solution)
     scatter = 0.0
     if freedom and chi2 > chdtri(freedom, READINGS_ALIKE):
@@ -500,6 +500,7 @@ def _told(r: Refinement, system: OverlapSystem, solution: Solution) -> dict[str,
         "after": {k: [a.size_K, a.z] for k, a in r.after.items()},
         "left_out_views_better": r.better,
         "references_K": scatter,
+        "gain": gain_of_readings(system, solution),
     }
 
 

@@ -354,7 +354,7 @@ class OverlapSystem:
     def reading_rows(self) -> list[tuple[ExpectedReading, Float, float]]:
         """Each reading with its derivative by the parameters and its weight."""
         at, out = self.layout, []
-        for reading, group, place in zip(self.readings, self.reading_groups, self._places(), strict=True):
+        for reading, group, place in zip(self.readings, self.reading_groups, self.places(), strict=True):
             row = np.zeros(at.size)
             row[group] = 1.0
             if np.isfinite(place.away):
@@ -368,7 +368,8 @@ class OverlapSystem:
             out.append((reading, row, 1 / (reading.sigma_measured**2 + (READING_FLOOR_K * self.slope_L) ** 2)))
         return out
 
-    def _places(self) -> tuple[KnownField, ...]:
+    def places(self) -> tuple[KnownField, ...]:
+        """Where the field is read for each reading."""
         return self.reading_places or tuple(KnownField(r.u_px, r.v_px) for r in self.readings)
 
     def _mean_reading(self) -> Level:
@@ -377,7 +378,7 @@ class OverlapSystem:
         variance = 1 / w.sum() + max(r.sigma_expected for r in self.readings) ** 2
         w /= w.sum()
         if self.keep.shape[1]:
-            variance += (self.slope_L * sum(wi * p.sigma_K for wi, p in zip(w, self._places(), strict=True))) ** 2
+            variance += (self.slope_L * sum(wi * p.sigma_K for wi, p in zip(w, self.places(), strict=True))) ** 2
         row = np.sum([wi * row for wi, (_, row, _) in zip(w, rows, strict=True)], axis=0)
         target = np.sum([wi * (r.measured - r.expected) for wi, r in zip(w, self.readings, strict=True)])
         return Level(row, float(target), float(variance))
