@@ -188,6 +188,18 @@ def test_measure_writes_csv_and_json(tmp_path):
     assert [c["sigma_K"] for c in document["changes"]] == [None, None]  # of a relative result
     assert document["regions"][2]["name"] == "vertex 7"
     assert document["regions"][2]["value_degC"] == pytest.approx(float(T[7]))
+    drawn = [Spot(name="s", point_m=(0, 0.1, 0)), Brush(name="cap", points_m=[(0, 0.1, 0)], normals=[(0, 1, 0)],
+                                                       radius_m=0.06)]  # fmt: skip
+    regions = write_regions(tmp_path / "drawn.json", drawn)
+    for _ in range(2):  # its own file is replaced
+        done = CliRunner().invoke(app, ["measure", str(tmp_path), "--regions", str(regions), "--labels"])
+        assert done.exit_code == 0, done.output
+    with np.load(tmp_path / "regions-labels.npz") as z:
+        labels = z["labels"]
+    upright_y = mesh.surface.vertices_m[:, 2]
+    away = np.linalg.norm(mesh.surface.vertices_m - [0, 0, 0.1], axis=1)
+    assert (labels == np.where(away < 0.06, 2, 0)).all()  # the second region; a spot covers nothing
+    assert upright_y[labels == 2].min() > 0.07
     nothing = CliRunner().invoke(app, ["measure", str(tmp_path)])  # `main` makes exit code 2 of it
     assert isinstance(nothing.exception, RecipeError)
 

@@ -59,17 +59,25 @@ def measure(
     before: Annotated[
         Path | None, typer.Option("--before", help="Result of an earlier visit: how each region changed since.")
     ] = None,
+    labels: Annotated[
+        bool, typer.Option("--labels", help="Also an .npz with each vertex's region, for materials of scan.json.")
+    ] = False,
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="Stem of the files; regions in the result.", callback=named)
     ] = None,
     json: Json = False,
 ) -> None:
     """What regions of interest read: mean, its uncertainty, area, left against right, change; as CSV and JSON."""
+    from io import BytesIO
+
+    import numpy as np
+
     from ..errors import RecipeError
     from ..files.json import to_json
-    from ..files.whole import write_text
+    from ..files.whole import write_text, write_whole
     from ..regions import Measured, Measurer, read_regions
     from ..results.folder import load_temperature
+    from ..version import __version__
 
     if regions is None and not vertex:
         raise RecipeError("nothing to measure", hint="give --regions FILE, or --vertex NUMBER")
@@ -85,6 +93,11 @@ def measure(
     files = {".csv": measured.csv(), "-budget.csv": measured.budget_csv(), ".json": to_json(measured.document()) + "\n"}
     for suffix, text in files.items():
         write_text(stem.with_name(stem.name + suffix), text)
+    if labels:
+        data = BytesIO()
+        np.savez_compressed(data, thermofusion=np.array(__version__), labels=measurer.labels(drawn))
+        write_whole(stem.with_name(stem.name + "-labels.npz"), [data.getvalue()])
     emit(measured.document(), measured.csv().rstrip(), json)
     if not json:
-        note(f"wrote {stem}.csv, {stem}-budget.csv and {stem}.json")
+        more = f", {stem}-labels.npz" if labels else ""
+        note(f"wrote {stem}.csv, {stem}-budget.csv{more} and {stem}.json")

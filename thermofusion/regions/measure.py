@@ -16,12 +16,12 @@ import numpy as np
 
 from ..errors import RecipeError
 from ..files.table import inert
-from ..types import Bool, BudgetInput, Float, SharedErrors, ThermalMesh, VertexFlag
+from ..types import Bool, BudgetInput, Float, Int, SharedErrors, ThermalMesh, VertexFlag
 from ..version import __version__
 from .body import Body, along
 from .budget import BudgetRow, UncertaintyBudget, between_visits, cause_of, of_difference, of_mean
 from .errors import DERIVED, MeanErrors, VertexErrors
-from .patch import Patch, patch_of
+from .patch import Patch, border_of, patch_of
 from .region import Line, Region, Slab, Spot, opposite
 from .volume import slab_volume, swelling_volume
 
@@ -241,6 +241,18 @@ class Measurer:
             off[mine] *= parts[cause] / size if size else 0.0
         found = MeanErrors(own, off, common, errors.names)
         return self._reading(f"vertex {number}", "vertex", float(self._T[number]), found, n=1)
+
+    def labels(self, regions: Sequence[Region]) -> Int:
+        """(V,) number of the region that a vertex lies in, from 1 in their order; 0 = in none.
+
+        Spots and lines cover nothing. Measured or not. Of two that overlap the later one lies on top, as with the
+        materials of a scan.
+        """
+        out = np.zeros(len(self.mesh), np.int32)
+        for number, region in enumerate(regions, 1):
+            if not isinstance(region, Spot | Line):
+                out[np.nan_to_num(border_of(region, self.body), nan=np.inf) < 0] = number
+        return out
 
     def budget(self, reading: Reading) -> UncertaintyBudget | None:
         """Of a reading on an absolute scale, else about the level common to the body; None = nothing measured."""
