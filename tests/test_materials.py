@@ -167,6 +167,8 @@ def test_a_dressing_is_read_foil_is_not_and_earlier_stages_stay(covered, tmp_pat
     assert said["foil"]["measured"] == 0
     assert said["dressing"]["vertices"] == (material == 1).sum()
     assert any("'foil'" in m and "reflects more than it emits" in m for m in result.report["messages"])
+    numbers = {row["what"]: row["value"] for row in result.report["radiometry"]}
+    assert numbers["emissivity of 'dressing'"] == "model = blackbody, epsilon0 = 0.85"
     other = replace(scan.materials[0], of_vertices=len(material) + 1)
     with pytest.raises(ScanError, match=f"this one has {len(material)}"):
         fuse(replace(bare, materials=(other,)), RECIPE)
