@@ -137,8 +137,8 @@ def radiometric_numbers(
     rows = [("emissivity ε(θ)", f"{e.model}{', ' * bool(shape)}{shape}", "recipe")]
     for m in scan.materials:
         stated = m.emissivity if isinstance(m.emissivity, dict) else {}
-        value = "as the skin" if m.emissivity == "skin" else ", ".join(f"{k} = {v}" for k, v in stated.items())
-        rows.append((f"emissivity of '{m.name}'", value or "not stated", "scan.json"))
+        told = "as the skin" if m.emissivity == "skin" else ", ".join(f"{k} = {v}" for k, v in stated.items())
+        rows.append((f"emissivity of '{m.name}'", told or "not stated", "scan.json"))
     each = _frame_by_frame(scan)
     for what, key, chosen, of_scan in (
         ("reflected temperature", "reflected_degC", settings.reflected_degC, room.reflected_degC),
