@@ -28,10 +28,8 @@ def limits(diagnosis: Sequence[Mapping[str, Any]], error: MapError) -> tuple[str
     named = [d["what"] for d in diagnosis]
     shared, out = [what for what in named if what in SHARED_FAULTS], []
     if shared:
-        text = (
-            f"the map's error cannot be told to a fifth: {', '.join(shared)} - halves of the views share what that does"
-        )
-        out.append(f"{text}, so the true error is larger than expected here")
+        text = f"the map's error cannot be told to a fifth, it is larger than expected here: {', '.join(shared)}"
+        out.append(f"{text}; all views share what that does")
     if error.tail_share > TAIL_CARRIES:
         text = f"the RMSE cannot be told to a fifth: one spot in a hundred carries {error.tail_share:.0%} of it"
         out.append(f"{text}, squared")
