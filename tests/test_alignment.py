@@ -10,9 +10,11 @@ from scipy.spatial.transform import Rotation
 from support.truth import truth_of
 from support.walkround import ROOM_DEGC, T_THERMAL_DEPTH, blank, ellipsoid, make_scan, repainted, walk
 
+from thermofusion.diagnosis import of_knocks
 from thermofusion.errors import ScanError
 from thermofusion.geometry._open3d import o3d
-from thermofusion.geometry.rigid import invert, pose, se3_exp, se3_log
+from thermofusion.geometry.rigid import interpolate_trajectory, invert, pose, se3_exp, se3_log
+from thermofusion.mapping.views import thermal_views
 from thermofusion.recipe import load_recipe
 from thermofusion.rig.align import RigResult, align
 from thermofusion.rig.estimate import PRIOR_TIME_S
@@ -108,6 +110,36 @@ def test_right_rig_is_left_alone(body, scan):
     assert result.residual_px_before < 0.3
     assert result.frame_dt_s is None
     assert result.depth_scale == 0
+    assert result.knocks is None
+
+
+@pytest.mark.parametrize(
+    ("stands_deg", "first"),
+    [([[-2.0, 2.5, 1.0]], [15]), ([[0.0, 0.6, 0.0], [0.7, 0.6, 0.0]], [7, 16])],
+)
+def test_a_camera_that_was_knocked_has_a_rig_before_and_another_one_after(body, scan, stands_deg, first):
+    """Beyond the reach of edges, and twice within it; told to the frame."""
+    twist = np.zeros((24, 6))
+    for rotation_deg, frame in zip(stands_deg, first, strict=True):
+        twist[frame:, :3] = np.radians(rotation_deg)
+    result = aligned(make_scan(body, walk(), knocked=twist), body, walk())
+    assert result.knocks.frame.tolist() == first
+    off = se3_log(result.knocks.of(np.arange(24)) @ invert(se3_exp(twist)))
+    assert np.degrees(np.linalg.norm(off[:, :3], axis=1)).max() < 0.15
+    assert errors(result, T_THERMAL_DEPTH)[0] < 0.1
+    assert result.residual_px_after < 0.3
+    size_deg, _ = result.knocks.sizes()
+    steps = np.diff([[0.0, 0.0, 0.0], *stands_deg], axis=0)
+    assert size_deg == pytest.approx(np.linalg.norm(steps, axis=1).max(), abs=0.1)
+    (entry,) = of_knocks(result.knocks, np.arange(24))
+    assert entry.what == "thermal camera was knocked"
+    assert f"frame {first[0]}" in entry.where
+    # and so each view stands where it was taken
+    views, _ = thermal_views(scan, walk(), 0.1, result.camera, None, result.knocks.of(np.arange(24)))
+    T_world_depth, _ = interpolate_trajectory(walk(), scan.thermal.times_s)
+    true = T_world_depth @ invert(se3_exp(twist) @ T_THERMAL_DEPTH)
+    apart = se3_log(invert(true) @ views.T_world_thermal)
+    assert np.degrees(np.linalg.norm(apart[:, :3], axis=1)).max() < 0.15
 
 
 def test_a_wrong_scale_of_depth_is_told_from_a_turned_rig(body, scan):

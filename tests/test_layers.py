@@ -49,7 +49,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "rig": (*BASE, "physics", "motion"),
     "mapping": (*BASE, "physics", "motion", "rig", "scans"),
     "temperature": (*BASE, "physics", "mapping"),
-    "diagnosis": (*BASE, "tracking", "mapping", "temperature"),
+    "diagnosis": (*BASE, "tracking", "rig", "mapping", "temperature"),
     "export": BASE,
     "regions": (*BASE, "export"),
     "report": (*BASE, "physics", "motion", "diagnosis", "export", "regions", *STEPS),

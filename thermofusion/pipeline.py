@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 STAGES = (
     Stage("tracking", ("input", "subject", "tracking"), edition=3),
     Stage("surface", ("input", "subject", "surface"), edition=7),
-    Stage("rig", ("input", "rig"), edition=5),
+    Stage("rig", ("input", "rig"), edition=6),
     Stage("mapping", ("input", "mapping"), edition=12),
     Stage("temperature", ("mapping", "temperature"), edition=16, handed_out=RESULT),
 )

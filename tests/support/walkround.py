@@ -76,18 +76,24 @@ def render(mesh: SurfaceMesh, T_world_thermal: np.ndarray, seed: int) -> np.ndar
 
 
 def make_scan(
-    mesh: SurfaceMesh, trajectory: Trajectory, *, sway: np.ndarray | None = None, readout_s: float = 0.0
+    mesh: SurfaceMesh,
+    trajectory: Trajectory,
+    *,
+    sway: np.ndarray | None = None,
+    readout_s: float = 0.0,
+    knocked: np.ndarray | None = None,
 ) -> Scan:
     """24 thermal frames. sway : (24, 6) twist in the world frame by which the body has moved in each, or None.
 
+    knocked : (24, 6) twist of the thermal camera on its rig, from the left of T_thermal_depth.
     readout_s : from the first row to the last, about the frame's time.
     """
     taken = np.linspace(0.3, trajectory.times_s[-1] - 0.3, 24)
     T_world_depth, _ = interpolate_trajectory(trajectory, taken)
     # A body moved by D looks as it does at rest to a camera moved by its inverse.
-    T_world_thermal = (
-        invert(se3_exp(np.zeros((24, 6)) if sway is None else sway)) @ T_world_depth @ invert(T_THERMAL_DEPTH)
-    )
+    still = np.zeros((24, 6))
+    T_thermal_depth = se3_exp(still if knocked is None else knocked) @ T_THERMAL_DEPTH
+    T_world_thermal = invert(se3_exp(still if sway is None else sway)) @ T_world_depth @ invert(T_thermal_depth)
     if readout_s:
         rows_s = readout_s * ((np.arange(480) + 0.5) / 480 - 0.5)
         T_rows, _ = interpolate_trajectory(trajectory, (taken[:, None] + rows_s).ravel())

@@ -20,6 +20,7 @@ VOCABULARY = MappingProxyType(
         "depth scale is off": "measure something of known size with the depth camera, and the spacing of the cameras",
         "time stamps jitter": "let camera or software stamp each thermal frame when it is taken, not when it is stored",
         "rows are read one after another": "move the camera more slowly, or use one that takes all rows at once",
+        "thermal camera was knocked": "fix both cameras to one stiff plate, and calibrate the rig again",
         "outlines do not fit": "check the thermal clock, the rig and that nobody moved; repeat the scan more slowly",
         "recorded poses in another convention": "write T_world_depth in metres, quaternions as qx qy qz qw",
         "lines of recorded poses missing": "let the tracking write a line for every depth frame, or mark those it lost",

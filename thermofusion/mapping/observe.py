@@ -173,7 +173,9 @@ def observe(
         views, left_out = rig.free.views(stream), rig.free.left_out
         body = None  # their clock is another: the subject is seen at rest
     else:
-        views, left_out = thermal_views(scan, trajectory, input.max_pose_gap_ms / 1e3, rig.camera, rig.frame_dt_s)
+        moved = None if rig.knocks is None else rig.knocks.of(np.arange(len(stream)))
+        gap_s = input.max_pose_gap_ms / 1e3
+        views, left_out = thermal_views(scan, trajectory, gap_s, rig.camera, rig.frame_dt_s, moved)
     if mapping.view_motion and rig.free is None:  # free views follow the outline one by one already
         motion = view_corrections(stream, surface, views, rig.outline_width_px, body, progress=progress)
         views = replace(views, T_world_thermal=motion.T_world_thermal)

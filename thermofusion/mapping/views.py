@@ -20,6 +20,7 @@ def thermal_views(
     max_pose_gap_s: float,
     camera: ThermalCamera | None = None,
     frame_dt_s: Float | None = None,
+    motion: Float | None = None,
 ) -> tuple[ThermalViews, dict[str, int]]:
     """The thermal frames that have a pose, and how many were left out, by reason.
 
@@ -27,6 +28,7 @@ def thermal_views(
     on SE(3), and T_world_thermal = T_world_depth @ T_depth_thermal, (M, 4, 4).
 
     camera : the refined one, in place of the scan's own. frame_dt_s : (F,) what times of single frames lack.
+    motion : (F, 4, 4) of the thermal camera on the rig, from the left of T_thermal_depth.
     Raises ScanError if the scan has no thermal stream, or if not
     one thermal frame is left.
     """
@@ -52,6 +54,6 @@ def thermal_views(
             place=scan.root,
             hint=f"thermal runs {times_s[0]:.3f} to {times_s[-1]:.3f} s, the trajectory {t[0]:.3f} to {t[-1]:.3f} s",
         )
-    T_depth_thermal = invert(camera.T_thermal_depth)
+    T_depth_thermal = invert(camera.T_thermal_depth if motion is None else motion[good] @ camera.T_thermal_depth)
     frame = np.flatnonzero(good).astype(np.int32)
     return ThermalViews(frame, times_s[good], T_world_depth[good] @ T_depth_thermal), left_out

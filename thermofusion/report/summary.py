@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..diagnosis import Diagnosis, diagnose, of_poses
+from ..diagnosis import Diagnosis, diagnose, of_knocks, of_poses
 from ..errors import counted
 from ..export.palettes import beyond_range
 from ..geometry.rigid import invert, rotation_angle_deg
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from ..motion.body import BodyMotion
     from ..rig.align import RigResult
     from ..rig.free.place import FreeViews
+    from ..rig.knock import Knocks
     from ..surface.surface import SurfaceResult
     from ..temperature.solve import Temperature
     from ..tracking.track import TrackingResult
@@ -241,9 +242,16 @@ def _rig(scan: Scan, a: RigResult) -> dict[str, Any]:
         "sigma_translation_mm": a.sigma_translation_mm,
         "sigma_time_s": a.sigma_time_s,
         "jitter_s": a.jitter_s,
+        "knocks": None if a.knocks is None else _knocks(scan, a.knocks),
         "readout_s": None if a.readout is None else a.readout.readout_s,
         "views_used": a.views_used,
     }
+
+
+def _knocks(scan: Scan, k: Knocks) -> list[dict[str, Any]]:
+    """Each new stand of the thermal camera: its first frame, and what stands left of T_thermal_depth there."""
+    index = np.zeros(0, np.int64) if scan.thermal is None else scan.thermal.index
+    return [{"index": int(index[f]), "motion": T} for f, T in zip(k.frame, k.motion, strict=True)]
 
 
 def _free(scan: Scan, a: RigResult, free: FreeViews) -> dict[str, Any]:
@@ -309,6 +317,8 @@ def _temperature(t: Temperature) -> dict[str, Any]:
 def _diagnosis(scan: Scan, steps: Steps) -> tuple[Diagnosis, ...] | None:
     """What the data say against the model, poses first; None where no temperature was solved for and poses fit."""
     poses = of_poses(steps.tracking.faults)
+    if steps.rig is not None and scan.thermal is not None:
+        poses = (*poses, *of_knocks(steps.rig.knocks, scan.thermal.index))
     if steps.mapped is None or steps.temperature is None or scan.thermal is None:
         return poses or None
     lens = scan.thermal.camera.lens

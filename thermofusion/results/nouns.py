@@ -83,6 +83,7 @@ def stored() -> MappingProxyType[str, type]:
     from ..mapping.references import BlackbodyReading
     from ..rig.align import RigResult
     from ..rig.free.place import FreeViews
+    from ..rig.knock import Knocks
     from ..rig.rows import ReadOut
     from ..temperature.crosscal import Calibration
     from ..temperature.room.map import RoomMap
@@ -102,6 +103,7 @@ def stored() -> MappingProxyType[str, type]:
             "calibration/1": Calibration,
             "free-views/1": FreeViews,
             "image-field/1": ImageField,
+            "knocks/1": Knocks,
             "lost-range/1": LostRange,
             "mapped/5": Mapped,
             "mapped/4": Mapped,  # without `readout`
@@ -111,7 +113,8 @@ def stored() -> MappingProxyType[str, type]:
             "motion/1": MotionResult,
             "pose-fault/1": PoseFault,
             "read-out/1": ReadOut,
-            "rig/3": RigResult,
+            "rig/4": RigResult,
+            "rig/3": RigResult,  # without `knocks`
             "rig/2": RigResult,  # without `readout`
             "rig/1": RigResult,  # without `free`, `frame_dt_s`, `depth_scale`
             "room-map/1": RoomMap,

@@ -48,6 +48,7 @@ from .estimate import (
 )
 from .free.place import FreeViews, place_views
 from .jitter import frame_times
+from .knock import Knocks, find_knocks, settled
 from .outlines import read_outlines, search_shift
 from .rows import ReadOut, readout_time
 
@@ -62,6 +63,7 @@ SCALE_LEFT_CHI2 = 16.8  # 99 % of chi-square with 6 degrees of freedom: more is 
 MOST_NAMED = 8  # frames, in a message
 TIMES_ROUNDS = 2  # of solving for the rig, where the time of each view is unknown, too
 TOO_FEW = "too few points of the outline were found in the thermal images"
+AROUND_VIEWS = 2  # of those that enter, on either side of a knock: its frame is looked for among all frames there
 CLOCK_UNSURE = 0.1  # of its prior's sigma: a clock known better is known, whatever it correlates with
 
 
@@ -77,6 +79,7 @@ class RigResult:
     depth_scale : depth over truth less 1, where outlines ask for it or for cameras that stand farther apart by this
     share, and for nothing else; 0 = no news.
     readout : the time that reading an image's rows takes; None = no news.
+    knocks : where the camera stood from some frame on, `camera` being where it stood first; None = it stayed there.
     free : where each view of a camera that is not on the rig was taken; rig and clock then mean nothing.
     """
 
@@ -94,6 +97,7 @@ class RigResult:
     depth_scale: float = 0.0
     free: FreeViews | None = None
     readout: ReadOut | None = None
+    knocks: Knocks | None = None
 
     __repr__ = brief
 
@@ -158,21 +162,41 @@ def align(
             outlines, contrast = read_outlines(stream, stands, frames.tolist(), T_world_thermal, progress)
     if contrast is None or len(outlines) < MIN_VIEWS:
         return _unchanged(camera, "the outline does not stand out from the background in the thermal images")
-    times_s = stream.times_s[frames[[v.row for v in outlines]]]
-    measured = OutlineSet(camera.lens, trajectory, outlines, times_s, contrast)
-    result = _refined(measured, begin)
-    jitter = frame_times(measured, State.of(result.camera))
-    if jitter is not None:
-        result = _with_times(stream, body_at, measured, begin, input.max_pose_gap_ms / 1e3) or result
-    if result.frame_dt_s is not None:
-        measured = measured.later(result.frame_dt_s[frames[[v.row for v in outlines]]])
-    result = replace(result, readout=readout_time(measured, State.of(result.camera)))
+    shown = frames[[v.row for v in outlines]]
+    measured = OutlineSet(camera.lens, trajectory, outlines, stream.times_s[shown], contrast)
+    result = _fitted(stream, body_at, measured, begin, input.max_pose_gap_ms / 1e3, shown)
     if begin is camera:
         return result
     if not result.converged:
         return _unchanged(camera, "the outline was found far from where the rig says, but did not come to rest there")
     text = f"{_described(State.of(result.camera).distance(start)[RIG])}: calibrate it again"
     return replace(result, changed=True, messages=(text, *result.messages[1:]))
+
+
+def _fitted(
+    stream: ThermalStream,
+    body_at: BodyAt,
+    measured: OutlineSet,
+    begin: ThermalCamera,
+    max_gap_s: float,
+    shown: NDArray[np.intp],
+) -> RigResult:
+    """The rig; and where it does not fit all views, where the camera was knocked, the views' own times, the read-out.
+
+    shown : (N,) frames of the views that are measured.
+    """
+    result = _refined(measured, begin)
+    knocks = find_knocks(measured, State.of(result.camera), shown)
+    if knocks is not None:
+        knocks = _settled(stream, body_at, measured, knocks, begin, shown)
+        measured = measured.knocked(knocks.of(shown))
+        result = _refined(measured, begin)
+    jitter = frame_times(measured, State.of(result.camera))
+    if jitter is not None:
+        result = _with_times(stream, body_at, measured, begin, max_gap_s, knocks) or result
+    if result.frame_dt_s is not None:
+        measured = measured.later(result.frame_dt_s[shown])
+    return replace(result, readout=readout_time(measured, State.of(result.camera)), knocks=knocks)
 
 
 def _free(scan: Scan, mesh: SurfaceMesh, trajectory: Trajectory, progress: Progress) -> RigResult:
@@ -218,8 +242,36 @@ def _placed(
     return placed
 
 
+def _settled(
+    stream: ThermalStream,
+    body_at: BodyAt,
+    chosen: OutlineSet,
+    knocks: Knocks,
+    begin: ThermalCamera,
+    shown: NDArray[np.intp],
+) -> Knocks:
+    """Knocks, told to the frame by the outlines of all frames around them; shown : numbers of the views that enter."""
+    start = State.of(_refined(chosen.knocked(knocks.of(shown)), begin).camera)
+    cut = np.searchsorted(shown, knocks.frame)
+    around = zip(shown[cut - AROUND_VIEWS], shown[np.minimum(cut + AROUND_VIEWS, len(shown) - 1)], strict=True)
+    frames = np.unique(np.concatenate([np.arange(a, b) for a, b in around]))
+    taken_s = stream.times_s[frames] + start.time_offset_s
+    T_world_depth, known = interpolate_trajectory(chosen.trajectory, taken_s)
+    frames, taken_s, T_world_depth = (v[known & stream.usable[frames]] for v in (frames, taken_s, T_world_depth))
+    if not len(frames):
+        return knocks
+    views, _ = read_outlines(stream, body_at(taken_s), frames.tolist(), T_world_depth @ invert(start.T_thermal_depth))
+    seen = frames[[v.row for v in views]]
+    return settled(knocks, replace(chosen, views=views, times_s=stream.times_s[seen], motion=None), start, seen)
+
+
 def _with_times(
-    stream: ThermalStream, body_at: BodyAt, chosen: OutlineSet, begin: ThermalCamera, max_gap_s: float
+    stream: ThermalStream,
+    body_at: BodyAt,
+    chosen: OutlineSet,
+    begin: ThermalCamera,
+    max_gap_s: float,
+    knocks: Knocks | None,
 ) -> RigResult | None:
     """The rig again, with the time of each view unknown, and then the times of all frames; None where too few show it.
 
@@ -244,9 +296,12 @@ def _with_times(
     frames = np.flatnonzero(_placed(stream, chosen.trajectory, state.time_offset_s, 0.0, max_gap_s))
     taken_s = stream.times_s[frames] + state.time_offset_s
     T_world_depth, _ = interpolate_trajectory(chosen.trajectory, taken_s)
-    views, _ = read_outlines(stream, body_at(taken_s), frames.tolist(), T_world_depth @ invert(state.T_thermal_depth))
+    T_thermal_depth = state.T_thermal_depth if knocks is None else knocks.of(frames) @ state.T_thermal_depth
+    views, _ = read_outlines(stream, body_at(taken_s), frames.tolist(), T_world_depth @ invert(T_thermal_depth))
     seen = frames[[v.row for v in views]]
-    times = frame_times(replace(chosen, views=views, times_s=stream.times_s[seen]), state, sure=True)
+    motion = None if knocks is None else knocks.of(seen)
+    outlines = replace(chosen, views=views, times_s=stream.times_s[seen], motion=motion)
+    times = frame_times(outlines, state, sure=True)
     if times is None:
         return None
     dt_s = np.zeros(len(stream))

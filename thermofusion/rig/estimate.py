@@ -75,13 +75,18 @@ class Measured:
 
 @dataclass(frozen=True, eq=False)
 class OutlineSet:
-    """The outline in a set of thermal views, to be measured for any guess of the rig. times_s : the stream's own."""
+    """The outline in a set of thermal views, to be measured for any guess of the rig.
+
+    times_s : (N,) the stream's own. motion : (N, 4, 4) of the thermal camera on the rig since the scan began; None: it
+    stayed where it was.
+    """
 
     lens: Camera
     trajectory: Trajectory
     views: tuple[OutlineView, ...]
     times_s: Float
     contrast: Contrast
+    motion: Float | None = None
 
     def measure(self, state: State, reach: float) -> Measured:
         """Distances between model's and image's outline, edges looked for within `reach` px."""
@@ -101,6 +106,15 @@ class OutlineSet:
     def later(self, dt_s: Float) -> OutlineSet:
         """With views taken later than stamped, dt_s (N,)."""
         return replace(self, times_s=self.times_s + dt_s)
+
+    def knocked(self, motion: Float) -> OutlineSet:
+        """With the thermal camera moved on the rig, (N, 4, 4) from the left of T_thermal_depth."""
+        return replace(self, motion=motion)
+
+    def part(self, views: NDArray[np.intp]) -> OutlineSet:
+        """Some of the views, by number."""
+        motion = None if self.motion is None else self.motion[views]
+        return replace(self, views=tuple(self.views[i] for i in views), times_s=self.times_s[views], motion=motion)
 
     def twists(self, state: State) -> Float:
         """(N, 6) the world's twist in the thermal frame per second: rad/s, m/s."""
@@ -125,7 +139,10 @@ class OutlineSet:
         """T_thermal_world (N, 4, 4) of the views, and the world's twist in the thermal frame per second, (N, 6)."""
         times, h = self.times_s + state.time_offset_s, VELOCITY_STEP_S
         T_world_depth, _ = interpolate_trajectory(self.trajectory, np.concatenate([times, times - h, times + h]))
-        now, before, after = np.split(state.T_thermal_depth @ invert(T_world_depth), 3)
+        T_thermal_world = state.T_thermal_depth @ invert(T_world_depth)
+        if self.motion is not None:
+            T_thermal_world = np.tile(self.motion, (3, 1, 1)) @ T_thermal_world
+        now, before, after = np.split(T_thermal_world, 3)
         return now, se3_log(after @ invert(before)) / (2 * h)
 
 
