@@ -154,7 +154,9 @@ def radiometric_numbers(
     for i in inputs:
         if i.name == "reflected" and i.kind == "A":
             seen = f"{i.value - ZERO_DEGC_K:.2f} ± {i.u:.2f} °C"
-            rows.insert(2, ("reflected temperature that was used", seen, "background of the views"))
+            rows.insert(
+                2 + len(scan.materials), ("reflected temperature that was used", seen, "background of the views")
+            )
     if "relative_humidity_pct" in each:
         rows.append(("humidity", *each["relative_humidity_pct"]))
     elif room.relative_humidity_pct is not None:
