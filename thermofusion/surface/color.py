@@ -66,20 +66,21 @@ def _look(
     slope = np.sqrt(np.maximum(1 - cos**2, 0)) / cos * z * np.float32(1.5 * CELL_PX / camera.focal_px)
     visible = z < _nearest(u, v, z, camera) + HIDDEN_M + slope
     near, u, v, z = near[visible], u[visible], v[visible], z[visible]
-    rgb = image[np.rint(v).astype(np.intp), np.rint(u).astype(np.intp)].astype(np.float32)
+    pixel = np.rint(v).astype(np.intp) * w + np.rint(u).astype(np.intp)
+    rgb = image.reshape(-1, 3).take(pixel, axis=0).astype(np.float32)
     return near, rgb, (facing[near] ** 2 / z**2).astype(np.float32)
 
 
 def _nearest(u: Float32, v: Float32, z: Float32, camera: Camera) -> Float32:
     """Smallest z among the vertices in the cell of each and its eight neighbours."""
     rows, cols = camera.height_px // CELL_PX + 3, camera.width_px // CELL_PX + 3
-    r, c = (v / CELL_PX).astype(np.intp) + 1, (u / CELL_PX).astype(np.intp) + 1
+    cell = ((v / CELL_PX).astype(np.intp) + 1) * cols + (u / CELL_PX).astype(np.intp) + 1
     grid = np.full((rows, cols), np.inf, np.float32)
-    np.minimum.at(grid, (r, c), z)
+    np.minimum.at(grid.ravel(), cell, z)
     wide = np.minimum(np.minimum(grid[:-2], grid[1:-1]), grid[2:])
     full = np.full_like(grid, np.inf)
     full[1:-1, 1:-1] = np.minimum(np.minimum(wide[:, :-2], wide[:, 1:-1]), wide[:, 2:])
-    return full[r, c]
+    return full.ravel().take(cell)
 
 
 def _mean(views: list[tuple[NDArray[np.intp], Float32, Float32]], count: int, around: Float32 | None) -> Float32:
