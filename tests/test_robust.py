@@ -15,6 +15,8 @@ def test_the_median_is_numpys_bit_for_bit(dtype):
         for values in (rng.normal(size=n), np.round(rng.normal(size=n)), np.full(n, 2.5), np.sort(rng.normal(size=n))):
             values = values.astype(dtype)
             assert median(values) == float(np.median(values))
+    square = rng.normal(size=(7, 8)).astype(dtype)  # an image, say
+    assert median(square) == float(np.median(square))
 
 
 def test_a_gap_or_nothing_has_no_median():

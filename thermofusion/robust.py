@@ -50,10 +50,11 @@ def weighted_quantile(values: NDArray, weights: NDArray, q: float) -> float:
 
 
 def median(values: NDArray) -> float:
-    """Median of values (N,), any unit; NaN of none, and where there is one among them.
+    """Median of values, any shape and unit; NaN of none, and where there is one among them.
 
     As NumPy's, in a fifth of the time: a partition about both middle values at once takes ten times as long as one.
     """
+    values = np.ravel(values)
     middle = len(values) // 2
     if not len(values):
         return float("nan")
@@ -65,7 +66,7 @@ def median(values: NDArray) -> float:
 
 
 def mad_sigma(residual: NDArray) -> float:
-    """Sigma of residuals (N,), any unit, deaf to outliers: 1.4826 times their median absolute value; NaN of none."""
+    """Sigma of residuals, any shape, deaf to outliers: 1.4826 times their median absolute value; NaN of none."""
     return SIGMA_PER_MAD * median(np.abs(residual))
 
 
