@@ -544,6 +544,11 @@ class SharedErrors:
         return cls(tuple(effects_K), np.round(columns / step).astype(np.int8), step, focal_px, normal_window_m)
 
 
+def cause_of(name: str) -> str:
+    """The cause that a shared error belongs to: "reflected 3" is one of the errors of "reflected"."""
+    return name.split()[0]
+
+
 @dataclass(frozen=True)
 class BudgetInput:
     """One input of an uncertainty budget: value and standard uncertainty u in `unit` (1 = none); kind "A" or "B" of the

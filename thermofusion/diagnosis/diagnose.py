@@ -12,7 +12,7 @@ from ..temperature.sensor.pattern import Pattern
 from ..temperature.solve import Temperature
 from ..types import VertexFlag
 from .radiation import of_lens, of_room
-from .words import VOCABULARY, Diagnosis
+from .words import Diagnosis
 
 OUTLINE_PX = 0.4  # clean scans leave 0.15-0.3 px between the outlines of model and image
 GAIN_SIGMAS, LEAST_GAIN = 3.5, 0.005  # by which references must contradict the gain, and a share that is worth a word
@@ -35,7 +35,7 @@ def diagnose(mapped: Mapped, temperature: Temperature, image_px: tuple[int, int]
         evidence = f"{len(mapped.bad_pixels)} pixels ({share:.2%}) stand outside their neighbours in frame after frame"
         found.append(Diagnosis("dead pixels", evidence, None, "single pixels", "left out"))
     found.sort(key=lambda d: -(d.size_K or 0.0))
-    return tuple(replace(d, advice=VOCABULARY[d.what]) for d in found)
+    return tuple(found)
 
 
 def _skin(temperature: Temperature) -> list[Diagnosis]:

@@ -9,15 +9,12 @@ from numpy.typing import NDArray
 
 from ..rig.knock import Knocks
 from ..tracking.faults import PoseFault
-from .words import VOCABULARY, Diagnosis
+from .words import Diagnosis
 
 
 def of_poses(faults: Iterable[PoseFault]) -> tuple[Diagnosis, ...]:
     """Each fault as an entry; what it does to readings is not known once it is mended."""
-    return tuple(
-        Diagnosis(f.what, f.evidence, None, f.where, f.done, VOCABULARY[f.what], size=f.size, unit=f.unit)
-        for f in faults
-    )
+    return tuple(Diagnosis(f.what, f.evidence, None, f.where, f.done, size=f.size, unit=f.unit) for f in faults)
 
 
 def of_knocks(knocks: Knocks | None, index: NDArray[np.int64]) -> list[Diagnosis]:
@@ -31,4 +28,4 @@ def of_knocks(knocks: Knocks | None, index: NDArray[np.int64]) -> list[Diagnosis
     )
     where = "from thermal frame " + " and from ".join(str(int(index[f])) for f in knocks.frame) + " on"
     what, done = "thermal camera was knocked", "a rig of its own was solved for on either side"
-    return [Diagnosis(what, text, None, where, done, VOCABULARY[what], size=deg, unit="°")]
+    return [Diagnosis(what, text, None, where, done, size=deg, unit="°")]

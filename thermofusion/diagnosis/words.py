@@ -34,7 +34,8 @@ VOCABULARY = MappingProxyType(
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """One fault. size_K : its effect on readings, K, None where none is known. size : the fault's own, in `unit`."""
+    """One fault. size_K : its effect on readings, K, None where none is known. size : the fault's own, in `unit`.
+    advice : what a user can do, by default the vocabulary's."""
 
     what: str
     evidence: str
@@ -44,6 +45,10 @@ class Diagnosis:
     advice: str = ""
     size: float | None = None
     unit: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.advice:
+            object.__setattr__(self, "advice", VOCABULARY[self.what])
 
     def line(self) -> str:
         """For the terminal."""

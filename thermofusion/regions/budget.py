@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..types import BudgetInput
+from ..types import BudgetInput, cause_of
 from .errors import MeanErrors
 
 COVERAGE_FACTOR = 2.0  # of the expanded uncertainty: 95 % for a normal distribution
@@ -91,11 +91,6 @@ def between_visits(
         names.append(name)
         effects.append(a - b if cause_of(name) in SAME_AT_EACH_VISIT else float(np.hypot(a, b)))
     return UncertaintyBudget.of(quantity, _by_cause(own, tuple(names), np.array(effects)), inputs)
-
-
-def cause_of(name: str) -> str:
-    """The input that a shared error belongs to: "calibration 3" is one of the errors of "calibration"."""
-    return name.split()[0]
 
 
 def _by_cause(own_K: Mapping[str, float], names: Sequence[str], effects_K: np.ndarray) -> dict[str, float]:

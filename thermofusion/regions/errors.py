@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..types import Float, Float32, Int, SharedErrors, ThermalMesh
+from ..types import Float, Float32, Int, SharedErrors, ThermalMesh, cause_of
 from .body import Body
 from .patch import Patch
 
@@ -56,7 +56,7 @@ class MeanErrors:
         """The parts of `sigma_K`, by name: their squares add up."""
         groups: dict[str, float] = {}
         for name, effect in zip(self.names, self.common_K.tolist(), strict=True):
-            kind = name.split()[0]
+            kind = cause_of(name)
             groups[kind] = float(np.hypot(groups.get(kind, 0.0), effect))
         return {k: v for k, v in (self.own_K | groups).items() if v > 0}
 
@@ -90,7 +90,7 @@ class VertexErrors:
         parts = {k: np.nan_to_num(v) for k, v in mesh.uncertainty_parts.items()}
         zero = np.zeros(len(mesh), np.float32)
         noise, normals = parts.get("noise", zero), parts.get("normals", zero)
-        carried = {name.split()[0] for name in shared.names} if shared else set()  # signed, in the shared errors
+        carried = {cause_of(name) for name in shared.names} if shared else set()  # signed, in the shared errors
         apart = {*AVERAGED, *ALONG_GRADIENT, *DERIVED, *carried}
         rest = np.sqrt(sum((v.astype(np.float64) ** 2 for k, v in parts.items() if k not in apart), zero))
         if not parts:

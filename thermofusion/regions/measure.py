@@ -16,10 +16,10 @@ import numpy as np
 
 from ..errors import RecipeError
 from ..files.table import inert
-from ..types import Bool, BudgetInput, Float, Int, SharedErrors, ThermalMesh, VertexFlag
+from ..types import Bool, BudgetInput, Float, Int, SharedErrors, ThermalMesh, VertexFlag, cause_of
 from ..version import __version__
 from .body import Body, along
-from .budget import BudgetRow, UncertaintyBudget, between_visits, cause_of, of_difference, of_mean
+from .budget import BudgetRow, UncertaintyBudget, between_visits, of_difference, of_mean
 from .errors import DERIVED, MeanErrors, VertexErrors
 from .patch import Patch, border_of, patch_of
 from .region import Line, Region, Slab, Spot, opposite

@@ -188,7 +188,7 @@ def _fitted(
     result = _refined(measured, begin)
     knocks = find_knocks(measured, State.of(result.camera), shown)
     if knocks is not None:
-        knocks = _settled(stream, body_at, measured, knocks, begin, shown)
+        knocks = _settled(stream, body_at, measured, knocks, begin, max_gap_s, shown)
         measured = measured.knocked(knocks.of(shown))
         result = _refined(measured, begin)
     jitter = frame_times(measured, State.of(result.camera))
@@ -248,6 +248,7 @@ def _settled(
     chosen: OutlineSet,
     knocks: Knocks,
     begin: ThermalCamera,
+    max_gap_s: float,
     shown: NDArray[np.intp],
 ) -> Knocks:
     """Knocks, told to the frame by the outlines of all frames around them; shown : numbers of the views that enter."""
@@ -255,14 +256,29 @@ def _settled(
     cut = np.searchsorted(shown, knocks.frame)
     around = zip(shown[cut - AROUND_VIEWS], shown[np.minimum(cut + AROUND_VIEWS, len(shown) - 1)], strict=True)
     frames = np.unique(np.concatenate([np.arange(a, b) for a, b in around]))
-    taken_s = stream.times_s[frames] + start.time_offset_s
-    T_world_depth, known = interpolate_trajectory(chosen.trajectory, taken_s)
-    frames, taken_s, T_world_depth = (v[known & stream.usable[frames]] for v in (frames, taken_s, T_world_depth))
+    frames = frames[_placed(stream, chosen.trajectory, start.time_offset_s, 0.0, max_gap_s)[frames]]
     if not len(frames):
         return knocks
-    views, _ = read_outlines(stream, body_at(taken_s), frames.tolist(), T_world_depth @ invert(start.T_thermal_depth))
+    around_them, seen = _shown_by(stream, body_at, chosen, frames, start, None)
+    return settled(knocks, around_them, start, seen)
+
+
+def _shown_by(
+    stream: ThermalStream,
+    body_at: BodyAt,
+    chosen: OutlineSet,
+    frames: NDArray[np.intp],
+    state: State,
+    knocks: Knocks | None,
+) -> tuple[OutlineSet, NDArray[np.intp]]:
+    """The outlines of other frames (N,) than the chosen ones, as a rig predicts them, and which frames show any."""
+    taken_s = stream.times_s[frames] + state.time_offset_s
+    T_world_depth, _ = interpolate_trajectory(chosen.trajectory, taken_s)
+    T_thermal_depth = state.T_thermal_depth if knocks is None else knocks.of(frames) @ state.T_thermal_depth
+    views, _ = read_outlines(stream, body_at(taken_s), frames.tolist(), T_world_depth @ invert(T_thermal_depth))
     seen = frames[[v.row for v in views]]
-    return settled(knocks, replace(chosen, views=views, times_s=stream.times_s[seen], motion=None), start, seen)
+    motion = None if knocks is None else knocks.of(seen)
+    return replace(chosen, views=views, times_s=stream.times_s[seen], motion=motion), seen
 
 
 def _with_times(
@@ -294,13 +310,7 @@ def _with_times(
     result = _decided(chosen, begin, solved, before, chosen.later(times.dt_s).residual_px(state))
     state = State.of(result.camera)
     frames = np.flatnonzero(_placed(stream, chosen.trajectory, state.time_offset_s, 0.0, max_gap_s))
-    taken_s = stream.times_s[frames] + state.time_offset_s
-    T_world_depth, _ = interpolate_trajectory(chosen.trajectory, taken_s)
-    T_thermal_depth = state.T_thermal_depth if knocks is None else knocks.of(frames) @ state.T_thermal_depth
-    views, _ = read_outlines(stream, body_at(taken_s), frames.tolist(), T_world_depth @ invert(T_thermal_depth))
-    seen = frames[[v.row for v in views]]
-    motion = None if knocks is None else knocks.of(seen)
-    outlines = replace(chosen, views=views, times_s=stream.times_s[seen], motion=motion)
+    outlines, seen = _shown_by(stream, body_at, chosen, frames, state, knocks)
     times = frame_times(outlines, state, sure=True)
     if times is None:
         return None

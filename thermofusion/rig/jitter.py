@@ -75,7 +75,7 @@ def frame_times(outlines: OutlineSet, state: State, *, sure: bool = False) -> Fr
 
 def _gain_across(outlines: OutlineSet, state: State, m: Measured) -> float:
     """By how much left-out outline comes nearer by shifts across the velocity, px."""
-    across = m.jacobian[:, TWIST] @ _turned(outlines.twists(state)).T
+    across = m.jacobian[:, TWIST] @ turned(outlines.twists(state)).T
     before, after = _left_out(outlines, m, across[np.arange(len(m.view)), m.view])
     return before - after
 
@@ -124,6 +124,6 @@ def _left_out(outlines: OutlineSet, m: Measured, lever: Float) -> tuple[float, f
     return mad_sigma(residual), mad_sigma(after)
 
 
-def _turned(twist: Float) -> Float:
+def turned(twist: Float) -> Float:
     """Twists (N, 6) whose image velocity is turned by a right angle."""
     return np.concatenate([twist[:, :3] @ QUARTER_TURN.T, twist[:, 3:] @ QUARTER_TURN.T], axis=1)

@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.rigid import invert
+from ..geometry.rigid import invert, rotation_angle_deg
 from ..robust import SIGMA_PER_MAD, TUKEY, mad_sigma, tukey_weight
 from ..types import Float
 from .estimate import REACH_DEG, RIG, ROTATION, TWIST, Measured, OutlineSet, State, solve
@@ -55,8 +55,8 @@ class Knocks:
     def sizes(self) -> tuple[float, float]:
         """The largest turn, deg, and the largest shift, mm, from one stand to the next."""
         steps = self.motion @ invert(np.concatenate([np.eye(4)[None], self.motion[:-1]]))
-        cosine = np.clip((np.trace(steps[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1)
-        return float(np.degrees(np.arccos(cosine)).max()), float(1e3 * np.linalg.norm(steps[:, :3, 3], axis=1).max())
+        shift_m = np.linalg.norm(steps[:, :3, 3], axis=1)
+        return float(rotation_angle_deg(steps).max()), float(1e3 * shift_m.max())
 
 
 def find_knocks(outlines: OutlineSet, start: State, frames: NDArray[np.intp]) -> Knocks | None:
@@ -68,15 +68,13 @@ def find_knocks(outlines: OutlineSet, start: State, frames: NDArray[np.intp]) ->
     cuts = _cuts(outlines, start, MOST)
     if not cuts:
         return None
-    bounds = [0, *cuts, len(frames)]
-    stands = [_stand(outlines.part(np.arange(a, b)), start) for a, b in pairwise(bounds)]
-    if any(s is None for s in stands):
+    stands = [_stand(side, start) for side in _sides(outlines, cuts)]
+    states = [stand[0] for stand in stands if stand is not None]
+    if len(states) < len(stands):
         return None
-    T = np.array([s[0].T_thermal_depth for s in stands if s is not None])
+    T = np.array([state.T_thermal_depth for state in states])
     found = Knocks(frames[cuts], T[1:] @ invert(T[0]), outlines.residual_px(start), 0.0)
-    first = stands[0]
-    assert first is not None
-    return replace(found, after_px=outlines.knocked(found.of(frames)).residual_px(first[0]))
+    return replace(found, after_px=outlines.knocked(found.of(frames)).residual_px(states[0]))
 
 
 def settled(knocks: Knocks, around: OutlineSet, start: State, frames: NDArray[np.intp]) -> Knocks:
@@ -108,7 +106,7 @@ def _cuts(outlines: OutlineSet, start: State, most: int, first: int = 0) -> list
     m = outlines.measure(start, reach_px(outlines.lens, REACH_DEG[0]))
     lost = _lost(outlines, m)
     if lost is not None and most:
-        sides = [outlines.part(np.arange(lost)), outlines.part(np.arange(lost, n))]
+        sides = _sides(outlines, [lost])
         stands = [_stand(side, start) for side in sides]
         if stands[0] is None or stands[1] is None or not _differ(start, sides, stands):
             return []
@@ -116,14 +114,18 @@ def _cuts(outlines: OutlineSet, start: State, most: int, first: int = 0) -> list
         return [*before, first + lost, *_cuts(sides[1], stands[1][0], most - 1 - len(before), first + lost)]
     cuts = _steps(_turns(m, n), most)
     while cuts:
-        bounds = [0, *cuts, n]
-        sides = [outlines.part(np.arange(a, b)) for a, b in pairwise(bounds)]
+        sides = _sides(outlines, cuts)
         stands = [_stand(side, start) for side in sides]
         sure = [_differ(start, sides[k : k + 2], stands[k : k + 2]) for k in range(len(cuts))]
         if all(sure):
             break
         cuts = [cut for cut, good in zip(cuts, sure, strict=True) if good]
     return [first + cut for cut in cuts]
+
+
+def _sides(outlines: OutlineSet, cuts: Sequence[int]) -> list[OutlineSet]:
+    """The views up to the first cut, from there to the next, and so on."""
+    return [outlines.part(np.arange(a, b)) for a, b in pairwise([0, *cuts, len(outlines.views)])]
 
 
 def _lost(outlines: OutlineSet, m: Measured) -> int | None:

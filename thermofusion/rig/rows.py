@@ -17,7 +17,7 @@ from ..geometry.outline import project_contour
 from ..robust import TUKEY, mad_sigma, tukey_weight
 from ..types import Float
 from .estimate import REACH_DEG, TWIST, Measured, OutlineSet, State
-from .jitter import QUARTER_TURN
+from .jitter import turned
 from .outlines import MIN_SCALE_PX, reach_px
 
 MIN_VIEWS = 8
@@ -45,7 +45,7 @@ def readout_time(outlines: OutlineSet, state: State) -> ReadOut | None:
     m = outlines.measure(state, reach_px(outlines.lens, REACH_DEG[-1]))
     row = _rows(outlines, state)[m.point] / outlines.lens.height_px - 0.5
     twist = outlines.twists(state)
-    along, across = (row * (m.jacobian[:, TWIST] * t[m.view]).sum(1) for t in (twist, twist @ _quarter_turn().T))
+    along, across = (row * (m.jacobian[:, TWIST] * t[m.view]).sum(1) for t in (twist, turned(twist)))
     s, sigma = _solved(m, along)
     shift_px = abs(s) * float(np.sqrt(np.mean(along**2)))
     if not (abs(s) > MIN_SIGMAS * sigma and shift_px > MIN_SHIFT_PX):
@@ -67,11 +67,6 @@ def _rows(outlines: OutlineSet, state: State) -> Float:
         project_contour(outlines.lens, T, v.contour).uv_px for v, T in zip(outlines.views, T_thermal_world, strict=True)
     ]
     return np.concatenate(uv)[:, 1]
-
-
-def _quarter_turn() -> Float:
-    """(6, 6) that turns a twist's image velocity by a right angle."""
-    return np.kron(np.eye(2), QUARTER_TURN)
 
 
 def _solved(m: Measured, lever: Float) -> tuple[float, float]:

@@ -27,7 +27,7 @@ from ..errors import ScanError
 from ..geometry.patches import along_curve
 from ..physics.emissivity import AngleTable, EmissivityModel, reshaped, shape_direction
 from ..physics.equation import without_gain
-from ..robust import MAD_PER_SIGMA, NORMAL_95, median
+from ..robust import MAD_PER_SIGMA, NORMAL_95, evenly, median
 from ..types import Bool, Float, Float32, Observations, brief
 from .gain import GAIN_SPAN_K, gain_of_readings
 from .hidden import with_pattern
@@ -235,9 +235,8 @@ def _choose(observations: Observations, problem: ThermalProblem) -> Observations
             hint="cross-calibration needs overlap: choose another temperature.method",
         )
     size = min(len(shared), max_vertices, int(max_vertices * ROWS_PER_VERTEX / count[shared].mean()) + 1)
-    even = np.linspace(0, len(shared) - 1, size).round().astype(np.intp)
     wanted = np.zeros(len(problem), bool)
-    wanted[shared[along_curve(problem.points_m[shared], CURVE_M)[even]]] = True
+    wanted[shared[along_curve(problem.points_m[shared], CURVE_M)[evenly(len(shared), size)]]] = True
     for contact in problem.contacts:
         wanted[contact.vertices] = True
     rows = np.flatnonzero(usable & wanted[observations.vertex])

@@ -20,11 +20,11 @@ from ..mapping.observe import Mapped
 from ..physics.band import ZERO_DEGC_K
 from ..physics.emissivity import AngleTable, EmissivityModel, model_from_recipe
 from ..recipe import EmissivitySection
-from ..types import Bool, BudgetInput, Float, Int, Material, Scan
+from ..types import Bool, BudgetInput, Float, Int, Material, Scan, cause_of
 from .blend import BlendResult, blend
 from .crosscal import Calibration
 from .problem import ThermalProblem
-from .uncertainty import Uncertainty, cause_of
+from .uncertainty import Uncertainty
 
 MATERIAL_SIGMA = 0.03  # of an ε(0) whose sigma nobody stated: tables of cloth, hair and creams differ by as much
 LEAST_EPSILON0 = 0.5  # below it, an error of the room's temperature is larger in the result than it was

@@ -16,7 +16,7 @@ from ..physics.band import Band
 from ..physics.emissivity import AngleTable, EmissivityModel
 from ..recipe import TemperatureSection
 from ..robust import median
-from ..types import Float, Float32, Observations, ThermalCamera
+from ..types import Float, Float32, Observations, ThermalCamera, cause_of
 
 DEFAULT_SIGMA_NORMAL_DEG = 2.0  # of normals over a 25 mm window of a Kinect's surface
 DEFAULT_PSF_PX = 0.7  # point spread of a microbolometer camera in focus, where it was not measured
@@ -318,11 +318,6 @@ def vertex_uncertainty(
     if b.gain_pivot_K is not None:
         common["gain"] = errors.sigma_gain * (T_K - b.gain_pivot_K)
     return parts, common, modes
-
-
-def cause_of(name: str) -> str:
-    """The part of the budget that a shared error belongs to: "reflected 3" is one of the errors of "reflected"."""
-    return name.split()[0]
 
 
 def covariance_modes(covariance: Float, count: int) -> Float:

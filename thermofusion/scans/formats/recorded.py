@@ -441,12 +441,11 @@ def _with_thermal(scan: Scan, file: Path, thermal: _Recorded, clocks: Mapping[st
 
 def _sensor_of(recorded: _Recorded, stream: Stream) -> FrameConditions | None:
     """The sensor's temperature with each frame of a stream, where the camera told it."""
-    from ..native.schema import CONDITIONS
+    from ..native.schema import plausible
 
     degC = {entry.sequence: info.fpa_degC for entry, info in zip(recorded.frames, recorded.infos, strict=True)}
     column = np.array([degC[int(number)] for number in stream.index])
-    low, high = CONDITIONS["fpa_degC"]
-    return FrameConditions.of(len(column), {"fpa_degC": np.where((column >= low) & (column <= high), column, np.nan)})
+    return FrameConditions.of(len(column), {"fpa_degC": plausible("fpa_degC", column)})
 
 
 # ---------------------------------------------------------------- what is said

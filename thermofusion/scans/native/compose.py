@@ -14,7 +14,7 @@ from ...files.strict import validated
 from ...types import Camera, Environment, Float, FrameConditions, Scan, ThermalCamera, ThermalStream
 from ..common import as_thermal, make_rig, make_stream
 from ..thermal.frames import ThermalFrames
-from .schema import CONDITIONS, CameraDoc, DepthCorrectionDoc, RigDoc, camera_of, matrix_of, thermal_camera_of
+from .schema import CameraDoc, DepthCorrectionDoc, RigDoc, camera_of, matrix_of, plausible, thermal_camera_of
 
 CORRECTED_UNIT_M = 0.00025  # rounding to a millimetre would undo a correction of that size; 16 bits reach 16 m
 
@@ -174,8 +174,7 @@ def _changing(conditions: FrameConditions | None, stated: Environment) -> FrameC
     if conditions is None:
         return None
     known = {name: c for name, c in conditions.stated.items() if getattr(stated, name, None) is None}
-    inside = {name: np.where((c >= CONDITIONS[name][0]) & (c <= CONDITIONS[name][1]), c, np.nan)
-              for name, c in known.items()}  # fmt: skip
+    inside = {name: plausible(name, column) for name, column in known.items()}
     changing = {name: c for name, c in inside.items() if len(np.unique(c[np.isfinite(c)])) > 1}
     return FrameConditions.of(len(conditions.air_degC), changing)
 

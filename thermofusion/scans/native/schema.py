@@ -18,6 +18,7 @@ from ...types import (
     BlackbodyReference,
     Camera,
     ContactReference,
+    Float,
     LensScatter,
     Material,
     Reference,
@@ -142,6 +143,12 @@ CONDITIONS: dict[str, tuple[float, float]] = {
     "fpa_degC": (-80.0, 200.0),
     "lens_degC": (-80.0, 200.0),
 }
+
+
+def plausible(name: str, column: Float) -> Float:
+    """What files state of each frame, (N,) under one of `CONDITIONS`; NaN where it is out of bounds."""
+    low, high = CONDITIONS[name]
+    return np.where((column >= low) & (column <= high), column, np.nan)
 
 
 def _bounded(name: str) -> Any:
