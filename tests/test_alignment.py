@@ -133,6 +133,7 @@ def test_a_camera_that_was_knocked_has_a_rig_before_and_another_one_after(body, 
     assert size_deg == pytest.approx(np.linalg.norm(steps, axis=1).max(), abs=0.1)
     (entry,) = of_knocks(result.knocks, np.arange(24))
     assert entry.what == "thermal camera was knocked"
+    assert (entry.size, entry.unit) == (size_deg, "deg")
     assert f"frame {first[0]}" in entry.where
     # and so each view stands where it was taken
     views, _ = thermal_views(scan, walk(), 0.1, result.camera, None, result.knocks.of(np.arange(24)))

@@ -28,4 +28,4 @@ def of_knocks(knocks: Knocks | None, index: NDArray[np.int64]) -> list[Diagnosis
     )
     where = "from thermal frame " + " and from ".join(str(int(index[f])) for f in knocks.frame) + " on"
     what, done = "thermal camera was knocked", "a rig of its own was solved for on either side"
-    return [Diagnosis(what, text, None, where, done, size=deg, unit="°")]
+    return [Diagnosis(what, text, None, where, done, size=deg, unit="deg")]

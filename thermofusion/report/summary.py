@@ -139,6 +139,9 @@ def _rig_line(a: Mapping[str, Any]) -> str:
         size = f"{a['sigma_translation_mm']:.1f} mm, {a['sigma_rotation_deg']:.2f}°"
         return f"thermal camera by itself: {counted(a['views_used'], 'view')} placed to {size} (one sigma, median)"
     fits = "" if fit is None or not np.isfinite(fit) else f"; outlines fit to {fit:.2f} px"
+    if knocks := a.get("knocks"):
+        frames = ", ".join(str(k["index"]) for k in knocks)
+        return f"the thermal camera was knocked: a rig of its own from thermal frame {frames} on{fits}"
     if not a["changed"]:
         return f"the thermal camera stays where the recording says{fits}"
     return f"thermal camera turned by {a['rotation_deg']:.2f}°, clock {a['time_offset_s'] * 1e3:+.0f} ms{fits}"
