@@ -167,6 +167,22 @@ class EmissivitySection(_Section):
     )
 
 
+class FieldSection(_Section):
+    """What an earlier scan of the same camera found of its field; `run --field RESULT` fills it in."""
+
+    K: tuple[float, ...] = Field((), strict=False, max_length=14, description="rms of each of its 14 patterns, K")
+    sigma_K: tuple[float, ...] = Field((), strict=False, max_length=14, description="of each")
+    width_px: int = Field(0, ge=0, le=100_000, description="of that camera's image")
+    height_px: int = Field(0, ge=0, le=100_000, description="of that camera's image")
+    age_days: float | None = Field(None, description="since that scan, where both say when they were recorded")
+
+    @model_validator(mode="after")
+    def _whole(self) -> FieldSection:
+        if len(self.K) not in (0, 14) or len(self.sigma_K) != len(self.K) or min(self.sigma_K, default=1.0) <= 0:
+            raise ValueError("K and sigma_K hold 14 numbers each, and sigma_K none below or at 0")
+        return self
+
+
 class CrosscalSection(_Section):
     """What overlapping views are asked to settle."""
 
@@ -176,6 +192,7 @@ class CrosscalSection(_Section):
     gain: bool = Field(False, description="one gain of the camera, where references carry it")
     surroundings: bool = Field(True, description="the body's own radiation, reflected in folds")
     max_vertices: int = Field(40_000, ge=1000, le=10_000_000, description="vertices the solver uses; all are mapped")
+    field: FieldSection = FieldSection()
 
 
 class TemperatureSection(_Section):

@@ -28,6 +28,9 @@ def run(
     out: Annotated[Path, typer.Option("-o", "--out", help="Result folder.", callback=named)] = Path("out"),
     from_: Annotated[str | None, typer.Option("--from", help=f"Compute anew from this stage: {STAGES}.")] = None,
     until: Annotated[str | None, typer.Option("--until", help=f"Stop after this stage: {STAGES}.")] = None,
+    field: Annotated[
+        Path | None, typer.Option("--field", help="An earlier result of the same camera: its field is where to start.")
+    ] = None,
     follow: Annotated[
         bool, typer.Option("--follow", help="The scan is still being recorded: show the growing model first.")
     ] = False,
@@ -46,6 +49,10 @@ def run(
 
         ahead = followed(recording.scan, chosen)
     scan = recording.open()
+    if field is not None:
+        from ..results.earlier import with_field
+
+        chosen = with_field(chosen, scan, field)
     if dry_run:
         plans = pipeline.plan(scan, chosen, out, redo_from=from_)
         emit(plans, "\n".join(f"{p.name:<12} {'reuse' if p.reuse else 'compute'}  ({p.why})" for p in plans), json)

@@ -35,6 +35,7 @@ from .layout import Layout
 from .mean import Groups
 from .problem import ThermalProblem
 from .references import ContactReading, ExpectedReading
+from .sensor.earlier import CHANGED_AT_ALL, EarlierField, FieldPrior
 from .sensor.field import ImageField
 from .sensor.pattern import Pattern
 from .sensor.refine import Refinement, refine, solved_with
@@ -67,8 +68,8 @@ class Calibration:
     view_rms_K : (N_views,) weighted residual. outlier_fraction : share of observations left without weight.
     condition : of the offsets on what overlap can see. held : parameters asked for that the data cannot carry.
     sensor : what the sensor adds beyond the field. sigma_normal_deg : as residuals show it. pattern_sigma_K : of what
-    residuals still have in common by place in the image. criticism : what residuals said. messages : what a
-    user should know.
+    residuals still have in common by place in the image. criticism : what residuals said. field_change : of the field
+    since the earlier scan, over what fields are; NaN without one. messages : what a user should know.
     """
 
     offset_radiance: Float
@@ -94,6 +95,7 @@ class Calibration:
     sigma_normal_deg: float = DEFAULT_SIGMA_NORMAL_DEG
     pattern_sigma_K: float = 0.0
     criticism: dict[str, Any] = dataclasses.field(default_factory=dict)
+    field_change: float = float("nan")
 
     __repr__ = brief
 
@@ -154,13 +156,14 @@ def calibrate(problem: ThermalProblem) -> Calibration:
 
 @dataclass(frozen=True, eq=False)
 class Overlap:
-    """A problem's overlap, solved without a pattern of the sensor."""
+    """A problem's overlap, solved without a pattern of the sensor. held, field_change : as in `Calibration`."""
 
     problem: ThermalProblem
     system: OverlapSystem
     solution: Solution
     rows: Observations
     held: tuple[str, ...]
+    field_change: float
 
     @classmethod
     def of(cls, problem: ThermalProblem) -> Overlap:
@@ -196,7 +199,7 @@ class Overlap:
         return _result(replace(self, system=found.system, solution=found.solution, rows=found.rows), found)
 
 
-def _settled(problem: ThermalProblem) -> tuple[OverlapSystem, Solution, Observations, tuple[str, ...]]:
+def _settled(problem: ThermalProblem) -> tuple[OverlapSystem, Solution, Observations, tuple[str, ...], float]:
     """Solve for offsets, field, shape and gain from all vertices that two or more views saw, clear of outlines.
 
     Blackbodies set the level together, contact thermometers where no blackbody does. A million rows are not a million
@@ -208,14 +211,28 @@ def _settled(problem: ThermalProblem) -> tuple[OverlapSystem, Solution, Observat
     system = _system(chosen, problem)
     seen = max(int((np.bincount(rows.vertex, minlength=len(problem)) >= 2).sum()), 1)
     system = replace(system, correlated=max(1.0, problem.vertices_per_patch * system.n_vertices / seen))
-    solution = system.solve()
+    solution, settings, change = system.solve(), problem.settings.crosscal, float("nan")
+    earlier = EarlierField.of(settings.field, system.field, system.slope_L)
+    if earlier is not None and settings.vignetting:
+        system, change = _with_earlier(system, solution, earlier)
+        solution = system.solve(solution)
     reduced, held = _without_uncarried(system, solution)
-    settings = problem.settings.crosscal
     if settings.gain and not system.use_gain:
         held = ("gain", *held)
     if reduced is not system:
         system, solution = reduced, reduced.solve()
-    return system, solution, chosen, held
+    return system, solution, chosen, held, change
+
+
+def _with_earlier(system: OverlapSystem, solution: Solution, earlier: EarlierField) -> tuple[OverlapSystem, float]:
+    """The system that also knows what an earlier scan found of the field, as far as this scan's overlap bears it out;
+    and by how much the field changed since. References then read the field at their own places."""
+    at = system.layout
+    change = earlier.change(solution.p[at.field], solution.covariance[at.field, at.field])
+    system = replace(system, field_prior=earlier.prior(change))
+    if change < CHANGED_AT_ALL:
+        system = replace(system, reading_places=tuple(KnownField(r.u_px, r.v_px) for r in system.readings))
+    return system, change
 
 
 def _choose(observations: Observations, problem: ThermalProblem) -> Observations:
@@ -275,6 +292,7 @@ def _system(rows: Observations, problem: ThermalProblem) -> OverlapSystem:
         start=np.insert(np.cumsum(count), 0, 0).astype(np.int32),
         n_groups=problem.n_views if settings.offsets else 1,
         field=field,
+        field_prior=FieldPrior.wide(field, slope_L),
         keep=np.eye(len(field.coefficients))[:, :K],
         use_shape=settings.shape,
         use_gain=use_gain,
@@ -345,7 +363,7 @@ def _without_uncarried(system: OverlapSystem, solution: Solution) -> tuple[Overl
     K, held, keep, use_shape = at.n_patterns, [], system.keep, system.use_shape
     if K:
         # in units of what was known before: a combination of patterns that the data tell nothing of keeps a sigma of 1
-        prior = np.sqrt(1 / np.diag(system.field_prior()))
+        prior = np.sqrt(1 / np.diag(FieldPrior.wide(system.field, system.slope_L).precision))
         values, vectors = np.linalg.eigh(solution.covariance[at.field, at.field] / np.outer(prior, prior))
         carried = np.sqrt(np.maximum(values, 0)) < FIELD_HELD
         if not carried.all():
@@ -370,7 +388,7 @@ def _shape_bias(emissivity: EmissivityModel, sigma_normal_deg: float) -> float:
 
 def _result(overlap: Overlap, refinement: Refinement | None) -> Calibration:
     """The solution in terms of views and the whole field."""
-    problem, system, solution, rows, held = vars(overlap).values()
+    problem, system, solution, rows, held, change = vars(overlap).values()
     if refinement is not None and problem.settings.crosscal.vignetting:
         solution = with_pattern(system, solution, rows, problem.lens.width_px, refinement.hidden_K)
     at, n, slope = system.layout, problem.n_views, system.slope_L
@@ -425,7 +443,8 @@ def _result(overlap: Overlap, refinement: Refinement | None) -> Calibration:
         sigma_normal_deg=_sigma_normal_deg(rows, system, solution, problem),
         pattern_sigma_K=0.0 if refinement is None else refinement.left_K,
         criticism={} if refinement is None else _told(refinement, system, solution),
-        messages=_messages(system, solution, held, _groups(rows, n, solution.weight > 0)),
+        field_change=change,
+        messages=_messages(system, solution, held, _groups(rows, n, solution.weight > 0), change),
     )
 
 
@@ -503,12 +522,16 @@ def _told(r: Refinement, system: OverlapSystem, solution: Solution) -> dict[str,
     }
 
 
-def _messages(system: OverlapSystem, solution: Solution, held: tuple[str, ...], groups: int) -> tuple[str, ...]:
+def _messages(
+    system: OverlapSystem, solution: Solution, held: tuple[str, ...], groups: int, change: float
+) -> tuple[str, ...]:
     out = []
     if not solution.converged:
         out.append("the cross-calibration stopped before it converged")
     if not system.anchored:
         out.append("no reference sets the level: temperatures are relative")
+    if change >= CHANGED_AT_ALL:
+        out.append(f"the earlier scan's field is of no use: it changed by {change:.1f} of what fields of cameras are")
     if held:
         out.append(f"held, because the overlap does not carry it: {', '.join(held)}")
     if groups > 1:

@@ -280,6 +280,7 @@ def _crosscal_report(c: Calibration, mapped: Mapped, problem: ThermalProblem, re
         "view_frames": mapped.views.frame,
         "view_rms_K": c.view_rms_K,
         "field": table(c.field, c.sensor, c.slope_L),
+        "field_change": c.field_change,
         "field_rms_K": float(np.sqrt((c.field.coefficients**2).sum()) / c.slope_L),
         "shape": c.shape,
         "shape_sigma": c.shape_sigma,

@@ -20,6 +20,7 @@ from ..types import Bool, Float, Int
 from .layout import Layout
 from .mean import Groups
 from .references import ExpectedReading
+from .sensor.earlier import FieldPrior
 from .sensor.field import ImageField
 
 HUBER_STEPS, TUKEY_STEPS = 4, 40
@@ -28,7 +29,6 @@ COARSE_VERTICES = 5000  # enough for a first estimate
 CONVERGED_K = 1e-4  # a hundredth of what any result is good to
 SENSOR_CONVERGED_K = 2e-3  # of a single pixel's or column's part: a vertex's mean knows a tenth of it
 OFFSET_PRIOR_K = 5.0  # spread of offsets about their mean: only matters for views that overlap with none
-FIELD_PRIOR_K = {1: 0.15, 2: 0.15, 3: 0.07, 4: 0.07}  # rms of a field pattern by polynomial order; 0.1-0.3 K together
 FIELD_UNKNOWN_K, FIELD_MEMORY = 0.3, 0.25  # one sigma of the field's change over this share of the image width
 SHAPE_PRIOR = 2.0
 SHAPE_BOUNDS = (-2.0, 5.0)
@@ -123,6 +123,7 @@ class OverlapSystem:
     start: Int
     n_groups: int
     field: ImageField
+    field_prior: FieldPrior
     keep: Float
     use_shape: bool
     use_gain: bool
@@ -327,17 +328,14 @@ class OverlapSystem:
         p[at.shape] = np.clip(p[at.shape], *SHAPE_BOUNDS)
         return p, (c - B @ p) / a, covariance, N, level_gain, level.variance
 
-    def field_prior(self) -> Float:
-        """(K, K) inverse covariance of the combinations solved for, before the data."""
-        prior = np.array([(FIELD_PRIOR_K[n] * self.slope_L) ** -2 for n in self.field.orders])
-        return np.asarray(self.keep.T @ (prior[:, None] * self.keep))
-
     def _add_priors(self, N: Float, rhs: Float) -> None:
         """Weak knowledge that only matters where the overlap has none, never about the common level."""
         at = self.layout
         M = at.n_offsets
         N[at.offsets, at.offsets] += (OFFSET_PRIOR_K * self.slope_L) ** -2 * (np.eye(M) - 1 / M)
-        N[at.field, at.field] += self.field_prior()
+        known = self.field_prior.precision @ self.keep
+        N[at.field, at.field] += self.keep.T @ known
+        rhs[at.field] += self.field_prior.mean @ known
         N[at.shape, at.shape] += SHAPE_PRIOR**-2
         N[at.gain, at.gain] += GAIN_PRIOR**-2
         if self.sensor is not None:
