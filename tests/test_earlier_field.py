@@ -11,7 +11,7 @@ from test_crosscal import blackbodies
 
 from thermofusion.errors import RecipeError, ScanError
 from thermofusion.files.shipped import data_dir
-from thermofusion.recipe import CrosscalSection, FieldSection, TemperatureSection, load_recipe
+from thermofusion.recipe import CrosscalSection, EarlierFieldSection, TemperatureSection, load_recipe
 from thermofusion.results.artifacts import save_artifact
 from thermofusion.results.earlier import with_field
 from thermofusion.scans import open_scan
@@ -27,7 +27,7 @@ LEFT_PX = 200  # of the image: beyond it the short scan sees no skin
 
 def solved(world, field=None, rows=None, **known):
     """The calibration, and the temperatures of the vertices, from a world's views."""
-    settings = TemperatureSection(crosscal=CrosscalSection(field=field or FieldSection()))
+    settings = TemperatureSection(crosscal=CrosscalSection(field=field))
     rows = world.observations if rows is None else rows
     problem = problem_of(rows, world.n_vertices, world.n_views, settings=settings, **known)
     found = calibrate(problem)
@@ -90,7 +90,7 @@ def test_a_blackbody_where_no_skin_was_seen_is_read_with_the_earlier_field():
     world, field = make_world(2), ImageField.zero(WIDTH, HEIGHT)
     v, u = (a.ravel() for a in np.mgrid[0:HEIGHT:8, 0:WIDTH:8].astype(float))
     K = np.linalg.lstsq(np.column_stack([np.ones(len(u)), field.patterns(u, v)]), vignetting_K(u, v))[0][1:]
-    calibrated = FieldSection(K=tuple(K), sigma_K=(0.01,) * len(K), width_px=WIDTH, height_px=HEIGHT)
+    calibrated = EarlierFieldSection(K=tuple(K), sigma_K=(0.01,) * len(K), width_px=WIDTH, height_px=HEIGHT)
     rows = world.observations.select(world.observations.u_px < LEFT_PX)
     known = {"blackbodies": tuple(blackbodies(world, u=310.0, v=120.0))}
     bare, _ = solved(world, rows=rows, **known)
@@ -120,6 +120,10 @@ def test_a_result_folder_hands_its_field_on(found, earlier, tmp_path):
     recipe = with_field(load_recipe("torso"), scan, tmp_path)
     assert recipe.temperature.crosscal.field == earlier.model_copy(update={"age_days": 2.0})
     assert load_recipe(recipe.model_dump(mode="json")) == recipe
+    other = replace(found, field=replace(found.field, width_px=640))
+    save_artifact(tmp_path / "result.npz", Temperature(mesh, nan, nan, nan, calibration=other))
+    with pytest.raises(ScanError, match="of 640 x 240 px, the thermal images of 320 x 240"):
+        with_field(recipe, scan, tmp_path)
     save_artifact(tmp_path / "result.npz", Temperature(mesh, nan, nan, nan))
     with pytest.raises(ScanError, match="found no field of the camera"):
         with_field(recipe, scan, tmp_path)
@@ -128,5 +132,5 @@ def test_a_result_folder_hands_its_field_on(found, earlier, tmp_path):
 def test_another_cameras_field_is_refused(earlier):
     with pytest.raises(ScanError, match="of 640 x 480 px, the thermal images of 320 x 240"):
         solved(make_world(1, n_vertices=500), earlier.model_copy(update={"width_px": 640, "height_px": 480}))
-    with pytest.raises(RecipeError, match="14 numbers each"):
-        load_recipe({"temperature": {"crosscal": {"field": {"K": [0.1], "sigma_K": [0.1]}}}})
+    with pytest.raises(RecipeError, match=r"field\.K"):
+        load_recipe({"temperature": {"crosscal": {"field": {**earlier.model_dump(), "K": [0.1]}}}})

@@ -29,6 +29,7 @@ SPECIAL = {  # where a value has to fit others
     "temperature.emissivity.values": [0.98, 0.2],
     "temperature.emissivity.k": 0.1,
     "temperature.emissivity.model": "water",
+    "temperature.crosscal.field": {"K": [0.05] * 14, "sigma_K": [0.05] * 14, "width_px": 160, "height_px": 120},
     "temperature.method": "mean",
     "temperature.air_degC": 30.0,
     "temperature.transmission_per_m": 0.9,

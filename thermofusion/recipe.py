@@ -167,20 +167,14 @@ class EmissivitySection(_Section):
     )
 
 
-class FieldSection(_Section):
-    """What an earlier scan of the same camera found of its field; `run --field RESULT` fills it in."""
+class EarlierFieldSection(_Section):
+    """What an earlier scan of a camera found of its field: the rms over the image of each pattern, and its sigma."""
 
-    K: tuple[float, ...] = Field((), strict=False, max_length=14, description="rms of each of its 14 patterns, K")
-    sigma_K: tuple[float, ...] = Field((), strict=False, max_length=14, description="of each")
-    width_px: int = Field(0, ge=0, le=100_000, description="of that camera's image")
-    height_px: int = Field(0, ge=0, le=100_000, description="of that camera's image")
-    age_days: float | None = Field(None, description="since that scan, where both say when they were recorded")
-
-    @model_validator(mode="after")
-    def _whole(self) -> FieldSection:
-        if len(self.K) not in (0, 14) or len(self.sigma_K) != len(self.K) or min(self.sigma_K, default=1.0) <= 0:
-            raise ValueError("K and sigma_K hold 14 numbers each, and sigma_K none below or at 0")
-        return self
+    K: tuple[Annotated[float, Field(ge=-100, le=100)], ...] = Field(strict=False, min_length=14, max_length=14)
+    sigma_K: tuple[Annotated[float, Field(gt=0, le=100)], ...] = Field(strict=False, min_length=14, max_length=14)
+    width_px: int = Field(ge=1, le=100_000)
+    height_px: int = Field(ge=1, le=100_000)
+    age_days: float | None = None
 
 
 class CrosscalSection(_Section):
@@ -192,7 +186,11 @@ class CrosscalSection(_Section):
     gain: bool = Field(False, description="one gain of the camera, where references carry it")
     surroundings: bool = Field(True, description="the body's own radiation, reflected in folds")
     max_vertices: int = Field(40_000, ge=1000, le=10_000_000, description="vertices the solver uses; all are mapped")
-    field: FieldSection = FieldSection()
+    field: EarlierFieldSection | None = Field(
+        None,
+        description="an earlier scan's field of the same camera, as `run --field RESULT` fills it in: `K`, `sigma_K` "
+        "of its 14 patterns, `width_px` and `height_px` of the image, `age_days`",
+    )
 
 
 class TemperatureSection(_Section):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -22,19 +23,27 @@ def register(app: typer.Typer) -> None:
     app.command()(spelled_out(export))
 
 
+@dataclass(frozen=True)
+class Part:
+    """Which stages of a run are computed."""
+
+    from_: Annotated[str | None, typer.Option("--from", help=f"Compute anew from this stage: {STAGES}.")] = None
+    until: Annotated[str | None, typer.Option("--until", help=f"Stop after this stage: {STAGES}.")] = None
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be computed, and why.")] = False
+
+
 def run(
     recording: Recording,
     processing: Processing,
     out: Annotated[Path, typer.Option("-o", "--out", help="Result folder.", callback=named)] = Path("out"),
-    from_: Annotated[str | None, typer.Option("--from", help=f"Compute anew from this stage: {STAGES}.")] = None,
-    until: Annotated[str | None, typer.Option("--until", help=f"Stop after this stage: {STAGES}.")] = None,
+    *,
+    part: Part,
     field: Annotated[
         Path | None, typer.Option("--field", help="An earlier result of the same camera: its field is where to start.")
     ] = None,
     follow: Annotated[
         bool, typer.Option("--follow", help="The scan is still being recorded: show the growing model first.")
     ] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be computed, and why.")] = False,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> int:
@@ -53,15 +62,15 @@ def run(
         from ..results.earlier import with_field
 
         chosen = with_field(chosen, scan, field)
-    if dry_run:
-        plans = pipeline.plan(scan, chosen, out, redo_from=from_)
+    if part.dry_run:
+        plans = pipeline.plan(scan, chosen, out, redo_from=part.from_)
         emit(plans, "\n".join(f"{p.name:<12} {'reuse' if p.reuse else 'compute'}  ({p.why})" for p in plans), json)
         return 0
     with progress(json) as step:
-        if from_ is None and until is None:
+        if part.from_ is None and part.until is None:
             result = pipeline.go_on(scan, chosen, ahead, out=out, progress=step, overwrite=overwrite)
         else:
-            ways = {"redo_from": from_, "until": until}
+            ways = {"redo_from": part.from_, "until": part.until}
             result = pipeline.fuse(scan, chosen, out=out, progress=step, **ways, overwrite=overwrite)
     emit(result.report, pipeline.summary(result.report, out), json)
     for line in renamed:

@@ -10,7 +10,7 @@ from ..errors import ScanError
 from ..files.reading import read_json
 from ..recipe import Recipe
 from ..report.metadata import stated
-from ..temperature.sensor.earlier import handed_on
+from ..temperature.sensor.earlier import SAME_CAMERA, handed_on, refuse_another_image
 from ..types import Scan
 from .claim import REPORT
 from .folder import load_temperature
@@ -30,10 +30,14 @@ def with_field(recipe: Recipe, scan: Scan, folder: Path) -> Recipe:
     report = read_json(folder / REPORT)
     serials = _serial(report.get("metadata", [])), _serial(stated(scan))
     if None not in serials and serials[0] != serials[1]:
-        hint = "give --field a result of the same camera"
-        raise ScanError("the earlier field is of another thermal camera (serial number)", place=folder, hint=hint)
+        raise ScanError(
+            "the earlier field is of another thermal camera (serial number)", place=folder, hint=SAME_CAMERA
+        )
     c = calibration
     found = handed_on(c.field, c.sensor, c.covariance[c.layout.field, c.layout.field], c.slope_L)
+    if scan.thermal is not None:
+        lens = scan.thermal.camera.lens
+        refuse_another_image(found, lens.width_px, lens.height_px)
     found = found.model_copy(update={"age_days": _days(report.get("scan", {}).get("recorded_at"), scan.recorded_at)})
     crosscal = recipe.temperature.crosscal.model_copy(update={"field": found})
     return recipe.model_copy(update={"temperature": recipe.temperature.model_copy(update={"crosscal": crosscal})})

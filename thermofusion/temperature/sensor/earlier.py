@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import ScanError
-from ...recipe import FieldSection
+from ...recipe import EarlierFieldSection
 from ...types import Float
 from .field import ImageField
 from .pattern import Pattern
@@ -17,6 +17,8 @@ from .shown import table
 FIELD_PRIOR_K = {1: 0.15, 2: 0.15, 3: 0.07, 4: 0.07}  # rms of a field pattern by polynomial order; 0.1-0.3 K together
 CHANGES = np.geomspace(0.03, 3.0, 41)  # by which a field may have changed, over what fields are
 CHANGED_AT_ALL = 0.5  # beyond it the earlier field says no more than that fields are small
+
+SAME_CAMERA = "give --field a result of the same camera"
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,16 +44,11 @@ class EarlierField:
     usual: Float
 
     @classmethod
-    def of(cls, section: FieldSection, field: ImageField, slope_L: float) -> EarlierField | None:
+    def of(cls, section: EarlierFieldSection | None, field: ImageField, slope_L: float) -> EarlierField | None:
         """As a recipe states it; None where it states none. Raises ScanError for a field of another image."""
-        if not section.K:
+        if section is None:
             return None
-        size, own = (section.width_px, section.height_px), (field.width_px, field.height_px)
-        if size != own:
-            raise ScanError(
-                "the earlier field is of {} x {} px, the thermal images of {} x {}".format(*size, *own),
-                hint="give --field a result of the same camera",
-            )
+        refuse_another_image(section, field.width_px, field.height_px)
         usual = np.array([FIELD_PRIOR_K[n] for n in field.orders]) * slope_L
         return cls(np.array(section.K) * slope_L, np.array(section.sigma_K) * slope_L, usual)
 
@@ -74,7 +71,17 @@ class EarlierField:
         return FieldPrior(self.mean, np.diag(1 / (self.sigma**2 + (change * self.usual) ** 2)))
 
 
-def handed_on(field: ImageField, sensor: Pattern | None, covariance: NDArray, slope_L: float) -> FieldSection:
+def refuse_another_image(section: EarlierFieldSection, width_px: int, height_px: int) -> None:
+    """Raises ScanError if an earlier field is not of thermal images of this size."""
+    if (section.width_px, section.height_px) != (width_px, height_px):
+        raise ScanError(
+            f"the earlier field is of {section.width_px} x {section.height_px} px, the thermal images of "
+            f"{width_px} x {height_px}",
+            hint=SAME_CAMERA,
+        )
+
+
+def handed_on(field: ImageField, sensor: Pattern | None, covariance: NDArray, slope_L: float) -> EarlierFieldSection:
     """A field for the next scan's recipe, with the smooth part of a fixed pattern.
 
     covariance : (K, K) of the field's coefficients, (W m-2 sr-1)². slope_L : dL/dT, W m-2 sr-1 K-1.
@@ -86,7 +93,7 @@ def handed_on(field: ImageField, sensor: Pattern | None, covariance: NDArray, sl
     sigma_K = np.sqrt(np.maximum(np.diag(covariance), 0.0)) / slope_L
     usual_K = np.array([FIELD_PRIOR_K[n] for n in field.orders])
     sigma_K = np.where(sigma_K > 0, sigma_K, usual_K)  # what was held is not known to be zero
-    return FieldSection(
+    return EarlierFieldSection(
         K=tuple(np.round(K, 5).tolist()),
         sigma_K=tuple(np.round(sigma_K, 5).tolist()),
         width_px=field.width_px,
