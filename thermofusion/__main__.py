@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import ctypes
+import gc
 import os
 import signal
 import sys
@@ -15,6 +16,8 @@ from .errors import INTERRUPTED, INTERRUPTED_SENTENCE
 
 # M_MMAP_THRESHOLD, M_TRIM_THRESHOLD, M_TOP_PAD in bytes, M_ARENA_MAX of GNU's mallopt (malloc.h)
 KEEP_MEMORY = {-3: 32 << 20, -1: 1 << 30, -2: 64 << 20, -8: 1}
+
+GARBAGE = 100_000, 20, 20  # objects made until cycles are looked for: half a second of a run goes into Python's own 700
 
 
 def main() -> None:
@@ -33,6 +36,7 @@ def main() -> None:
     signal.signal(signal.SIGINT, stop)
     sys.unraisablehook = unraisable
     _keep_memory()
+    gc.set_threshold(*GARBAGE)
     try:
         from .cli import main as run
 
