@@ -27,7 +27,15 @@ from thermofusion.recipe import load_recipe
 from thermofusion.surface import surface as fusion
 from thermofusion.surface.clean import subject_only
 from thermofusion.surface.surface import SurfaceResult, depth_poses, fuse_surface
-from thermofusion.surface.tsdf import Frames, VoxelGrid, depth_noise, integrate_frames, plan_grid, survey_depth
+from thermofusion.surface.tsdf import (
+    FramePoses,
+    Frames,
+    VoxelGrid,
+    depth_noise,
+    integrate_frames,
+    plan_grid,
+    survey_depth,
+)
 from thermofusion.types import Camera, Rig, Scan, Stream, Trajectory
 
 CAMERA = Camera(240, 180, np.array([[230.0, 0, 121.3], [0, 233.0, 88.2], [0, 0, 1]]))
@@ -473,3 +481,37 @@ def test_a_look_past_the_subject_empties_what_is_nearer_and_ends_in_no_surface()
     assert not ((x > left + 5e-3) & (x < right - 5e-3) & (np.abs(vertices[:, 2] - 1.0) < 5e-3)).any()
     assert vertices[:, 2].max() < 1.1
     np.testing.assert_allclose(vertices[(x < left - 0.02) | (x > right + 0.02), 2], 1.0, atol=2e-3)
+
+
+def test_frames_are_averaged_as_open3d_averages_them():
+    """Of every voxel, against Open3D's own loop over the same blocks, with a look past the subject."""
+    poses = orbit(6)
+    images = render([sphere((0, 0, 0), 0.15), post(0.1, 0.1, 0.06, -0.2, 0.2)], poses)
+    images[2] = np.where(np.isnan(images[2]), np.float32(-1.1), images[2])  # the room behind, as a look past
+    scan, recipe = scan_of(images), load_recipe(RECIPE)
+    frames, placed = DepthFrames(scan, recipe.input), FramePoses(np.arange(6), poses)
+    survey = survey_depth(scan, frames, placed)
+    plan = plan_grid(scan, survey, input=recipe.input, surface=recipe.surface)
+    ours, theirs = VoxelGrid(survey, plan, plan.blocks), VoxelGrid(survey, plan, plan.blocks)
+    tensor, K = ours._o3d.core.Tensor, CAMERA.K + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    for depth, T in zip(images, poses, strict=True):
+        assert ours.integrate(depth, T)
+        whole = ours._depth(depth)
+        blocks = theirs._blocks(np.maximum(whole, np.float32(0)), tensor(np.linalg.inv(T)))
+        seen = theirs._o3d.t.geometry.Image(tensor(np.abs(whole)))
+        theirs._grid.integrate(
+            blocks, seen, tensor(K), tensor(np.linalg.inv(T)), 1.0, plan.max_range_m, plan.truncation_m / plan.voxel_m
+        )
+
+    def voxels(grid):
+        table = grid._grid.hashmap()
+        row = table.active_buf_indices().numpy()
+        row = row[np.lexsort(table.key_tensor().numpy()[row].T)]
+        return [grid._grid.attribute(name).numpy().reshape(-1, 512)[row] for name in ("tsdf", "weight")]
+
+    (distance, weight), (their_distance, their_weight) = voxels(ours), voxels(theirs)
+    assert distance.shape == their_distance.shape
+    assert weight.max() > 3
+    same = weight == their_weight
+    assert same.mean() > 0.9999  # a voxel between two pixels may fall to either
+    assert np.abs(distance - their_distance)[same].max() < 1e-5

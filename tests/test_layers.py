@@ -13,7 +13,7 @@ from conftest import ROOT
 
 PACKAGE = ROOT / "thermofusion"
 NOUNS = ("types", "errors", "version", "progress")
-BASE = (*NOUNS, "robust", "recipe", "files", "geometry")
+BASE = (*NOUNS, "compiled", "robust", "recipe", "files", "geometry")
 STEPS = ("tracking", "surface", "rig", "mapping", "temperature")
 ALL = (
     *BASE,
@@ -36,6 +36,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "errors": (),
     "types": (),
     "progress": (),
+    "compiled": (),
     "robust": ("types", "errors"),
     "files": ("types", "errors", "version"),
     "recipe": ("errors", "files"),
@@ -71,7 +72,14 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
 CALIBRATION = {"board": (), "detect": ("board",), "fit": ("board", "detect"), "thermal": ()}
 # A module of one room that another may use, although the room itself is closed to it.
 PHANTOM_GEOMETRY = {"geometry.rigid", "geometry._open3d"}
-ONE_PLACE = {"usb": {"recording"}, "distributed": {"batch"}, "fsspec": {"batch"}, "typer": {"cli"}, "rich": {"cli"}}
+ONE_PLACE = {
+    "usb": {"recording"},
+    "numba": {"compiled"},
+    "distributed": {"batch"},
+    "fsspec": {"batch"},
+    "typer": {"cli"},
+    "rich": {"cli"},
+}
 PRINTS_OR_EXITS = ("print", "sys.exit", "exit", "quit")
 MOST_FILES, MOST_ON_TOP, MOST_LINES, MOST_ARGUMENTS, MANY_ARGUMENTS, WITH_MANY = 16, 10, 60, 9, 7, 4
 

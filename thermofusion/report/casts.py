@@ -116,7 +116,7 @@ class _Look:
     h: int
     w: int
 
-    def hits(self, scene: RayScene, down_px: Float32, across_px: Float32) -> Hits:
+    def hits(self, scene: RayScene, down_px: NDArray, across_px: NDArray) -> Hits:
         """Of rays through places (N,) px below and right of the picture's middle."""
         rays = np.empty((len(down_px), 6), np.float32)
         right, up = self.right.astype(np.float32), self.up.astype(np.float32)

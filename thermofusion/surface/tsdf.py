@@ -1,7 +1,7 @@
 """The voxel grid: a truncated signed distance field (TSDF) that depth frames are averaged into.
 
-Open3D's `VoxelBlockGrid` on the CPU. How many blocks a scan needs is estimated beforehand from a sample of frames, so
-memory is known and bounded before it is taken; the grid still grows if the sample missed something.
+Open3D's `VoxelBlockGrid` on the CPU, averaged by `average`. How many blocks a scan needs is estimated beforehand from
+a sample of frames, so memory is known and bounded before it is taken; it still grows if the sample missed something.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from ..progress import Progress, silent
 from ..recipe import InputSection, SurfaceSection
 from ..robust import SIGMA_PER_MAD
 from ..types import Camera, Float, Float32, Scan
+from .average import EDGE, VOXELS, Limits, Look, average_frame, pinhole_of
 
-BLOCK_VOXELS = 8  # voxels along the edge of a block
-BYTES_PER_BLOCK = BLOCK_VOXELS**3 * (8 + 16)  # tsdf and weight, plus the table that mesh extraction builds
+BYTES_PER_BLOCK = VOXELS * (8 + 16)  # tsdf and weight, plus the table that mesh extraction builds
 SURVEY_FRAMES, SURVEY_SHARE = 16, 1 / 12  # enough for ranges, noise and extent
 NOISE_M_AT_1M = 1.425e-3  # Kinect v1 depth noise is about this times z² (Khoshelham & Elberink 2012)
 NOISE_BOUNDS = (0.4e-3, 6e-3)  # of the coefficient estimated from the data
@@ -198,18 +198,20 @@ class VoxelGrid:
         float32 = (o3d.core.float32, o3d.core.float32)
         cpu = o3d.core.Device("CPU:0")
         self._grid = o3d.t.geometry.VoxelBlockGrid(
-            ("tsdf", "weight"), float32, one, plan.voxel_m, BLOCK_VOXELS, max(capacity, 1), cpu
+            ("tsdf", "weight"), float32, one, plan.voxel_m, EDGE, max(capacity, 1), cpu
         )
         # Open3D takes the pixel whose index is floor(u), which puts the first pixel's centre at (0.5, 0.5). Ours is at
         # (0, 0). Without the shift surfaces lie half a pixel aside: 0.43 instead of 0.23 mm mean error at 1.1 m.
         K = survey.camera.K.copy()
         K[:2, 2] += 0.5
-        self._K = o3d.core.Tensor(K)
+        self._pinhole = pinhole_of(K)
         self._multiplier = plan.truncation_m / plan.voxel_m
+        voxel_m = np.float32(plan.voxel_m)
+        self._limits = Limits(voxel_m, voxel_m * np.float32(self._multiplier), np.float32(plan.max_range_m))
         # Open3D looks for blocks along every fourth pixel's ray. A coarse image is enlarged for that: else the corner
         # of a block slips through between rays in most frames, and is a hole in the end.
         stride_m = TOUCH_STRIDE_PX * survey.median_range_m / survey.camera.focal_px
-        self._enlarge = max(1, int(np.ceil(TOUCHES_PER_BLOCK * stride_m / (BLOCK_VOXELS * plan.voxel_m))))
+        self._enlarge = max(1, int(np.ceil(TOUCHES_PER_BLOCK * stride_m / (EDGE * plan.voxel_m))))
         K_touch = K.copy()
         K_touch[:2] *= self._enlarge
         self._K_touch = o3d.core.Tensor(K_touch)
@@ -234,7 +236,8 @@ class VoxelGrid:
         False, with the field unchanged, if that needs more blocks than allowed. The table is enlarged before the blocks
         go in: one that overflows while they do loses blocks, and the surface gets holes.
         """
-        whole, extrinsic = self._depth(depth_m), self._o3d.core.Tensor(invert(T_world_depth))
+        T_depth_world = invert(T_world_depth)
+        whole, extrinsic = self._depth(depth_m), self._o3d.core.Tensor(T_depth_world)
         depth = whole
         if whole.min() < 0:
             depth, whole = np.maximum(whole, np.float32(0)), np.abs(whole)
@@ -247,8 +250,10 @@ class VoxelGrid:
                 return False
             if needed > 0.95 * table.capacity():
                 table.reserve(int(max(needed, table.capacity()) * GROWTH) + 8)
-        image = self._o3d.t.geometry.Image(self._o3d.core.Tensor(whole))
-        self._grid.integrate(blocks, image, self._K, extrinsic, 1.0, self._plan.max_range_m, self._multiplier)
+        table.activate(blocks)
+        distance, weight = (self._grid.attribute(name).numpy().reshape(-1, VOXELS) for name in ("tsdf", "weight"))
+        look = Look(whole, T_depth_world.astype(np.float32), self._pinhole)
+        average_frame(look, self._limits, blocks.numpy(), table.find(blocks)[0].numpy(), distance, weight)
         return True
 
     def extract(self, min_weight: float) -> tuple[Float32, NDArray[np.int32]]:
