@@ -10,16 +10,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.rigid import invert, se3_exp, transform_points
+from ..geometry.rigid import invert, se3_exp
 from ..robust import mad_sigma
 from ..types import Float
+from .loops import NEAREST_M, SEEN_FROM_M, Found, Image, Limits, Sent, add_up, match
 from .maps import DepthMap
 
-MAX_NORMAL_DEG = 45.0  # partners must face alike
+COS_FACING = float(np.cos(np.radians(45.0)))  # partners must face alike
 MIN_PARTNERS = 150  # a twentieth of a frame's points: fewer fix no pose
 NOISE_FLOOR_M = 3e-4  # at 1 m: no spread of residuals is believed to be smaller
 RANGE_BIAS_1_M = 0.01  # a depth camera's own error, as z², here at 1 m: what two views share of it cancels
@@ -76,41 +76,26 @@ def find_partners(
 
     T_target_source : (4, 4). stride : only every so many points.
     """
-    sample, R = source.sample[::stride], T_target_source[:3, :3]
-    p = _columns(transform_points(T_target_source, sample))
-    pixel, inside, off_u, off_v = _projected(target, p)
-    there = np.array(target.surface.take(pixel, axis=0).T, np.float64, order="C")
-    n, d = there[3:], p.take(inside, axis=1) - there[:3]
-    r = _dot(d, n)
-    good = np.flatnonzero((np.abs(r) < reach_m) & (_dot(d, d) < (3 * reach_m) ** 2))
-    own_n = _columns(_turned(R, source.sample_normals[::stride])).take(inside.take(good), axis=1)
-    good = good[_dot(own_n, n.take(good, axis=1)) > np.cos(np.radians(MAX_NORMAL_DEG))]
-    chosen, there = inside.take(good), there.take(good, axis=1)
-    p = p.take(chosen, axis=1)
+    found, inside, _ = _matched(source, target, T_target_source, reach_m, stride)
     color = None
     if target.texture is not None and source.sample_intensity is not None:
-        texture = np.array(target.texture.take(pixel.take(good), axis=0).T, np.float64, order="C")
-        texture[0] += texture[1] * off_u.take(chosen) + texture[2] * off_v.take(chosen)
-        own = source.sample_intensity[::stride].take(chosen)
-        color = _color_rows(p, own, texture, *target.intrinsics[:2])
-    share = len(good) / max(len(inside), 1)
-    bias = RANGE_BIAS_1_M * np.abs(sample[:, 2].take(chosen) ** 2 - there[2] ** 2)
-    return Partners(Rows(p, there[3:], r.take(good), bias), color, share, len(sample))
+        texture = np.array(target.texture.take(found.pixel, axis=0).T, np.float64, order="C")
+        texture[0] += texture[1] * found.off_px[0] + texture[2] * found.off_px[1]
+        own = source.sample_intensity[::stride].take(found.sent)
+        color = _color_rows(found.points, own, texture, *target.intrinsics[:2])
+    shape = Rows(found.points, found.directions, found.residual, found.bias)
+    return Partners(shape, color, len(found.residual) / max(inside, 1), -(-len(source.sample) // stride))
 
 
-def _turned(R: Float, rows: Float) -> Float:
-    """Directions (N, 3) turned by R (3, 3); see `transform_points`."""
-    return np.asarray(cv2.transform(rows[:, None], R)[:, 0], np.float64)
-
-
-def _columns(rows: Float) -> Float:
-    """(3, N) of rows (N, 3): NumPy's products and sums along the long axis take half the time."""
-    return np.ascontiguousarray(rows.T)
-
-
-def _dot(a: Float, b: Float) -> Float:
-    """(N,) products of columns a and b (3, N)."""
-    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+def _matched(
+    source: DepthMap, target: DepthMap, T_target_source: Float, reach_m: float, stride: int
+) -> tuple[Found, int, int]:
+    """(partners, points that project into the target, points that contradict it), see `loops.match`."""
+    room = Found.of(-(-len(source.sample) // stride))
+    sent = Sent(source.sample, source.sample_normals, stride)
+    image = Image(target.surface, target.shape, target.intrinsics)
+    inside, n, conflicts = match(sent, image, T_target_source, Limits(reach_m, COS_FACING, RANGE_BIAS_1_M), room)
+    return room.first(n), inside, conflicts
 
 
 @dataclass(frozen=True)
@@ -128,14 +113,8 @@ def seen_from(source: DepthMap, target: DepthMap, T_target_source: Float, reach_
 
     T_target_source : (4, 4). reach_m, stride : of `find_partners`.
     """
-    partners = find_partners(source, target, T_target_source, reach_m, stride)
-    p = transform_points(T_target_source, source.sample[::stride])
-    n = _turned(T_target_source[:3, :3], source.sample_normals[::stride])
-    pixel, ahead, _ = pixels_of(target, p)
-    front = np.einsum("ij,ij->i", p[ahead], n[ahead]) < 0  # what turns its back is hidden by itself
-    depth = target.surface[pixel[front], 2]
-    empty, through = np.isnan(depth), depth > p[ahead][front, 2] + reach_m
-    return Seen(len(partners), int((empty | through).sum()), len(p))
+    found, _, conflicts = _matched(source, target, T_target_source, reach_m, stride)
+    return Seen(len(found.residual), conflicts, -(-len(source.sample) // stride))
 
 
 def agreement(a: DepthMap, b: DepthMap, T_b_a: Float, stride: int = 1) -> float:
@@ -148,21 +127,15 @@ def agreement(a: DepthMap, b: DepthMap, T_b_a: Float, stride: int = 1) -> float:
 def pixels_of(target: DepthMap, p: Float) -> tuple[NDArray[np.intp], NDArray[np.intp], Float]:
     """Flat pixel of each point of the target's frame that falls inside its image; which points those are; and how far
     each falls from the pixel's centre, (N, 2)."""
-    pixel, inside, off_u, off_v = _projected(target, _columns(p))
-    return pixel, inside, np.stack([off_u.take(inside), off_v.take(inside)], axis=1)
-
-
-def _projected(target: DepthMap, p: Float) -> tuple[NDArray[np.intp], NDArray[np.intp], Float, Float]:
-    """As `pixels_of`, of columns p (3, N); the distances from the pixels' centres of all points, (N,) along u and v."""
     fx, fy, cx, cy = target.intrinsics
     h, w = target.shape
-    x, y, z = p
-    near = np.maximum(z, 1e-3)
+    x, y, z = np.ascontiguousarray(p.T)
+    near = np.maximum(z, NEAREST_M)
     u, v = x / near * fx + cx, y / near * fy + cy
     column, row = np.rint(u), np.rint(v)
-    inside = np.flatnonzero((z > 0.1) & (column >= 0) & (row >= 0) & (column < w) & (row < h))
+    inside = np.flatnonzero((z > SEEN_FROM_M) & (column >= 0) & (row >= 0) & (column < w) & (row < h))
     pixel = (row * w + column).take(inside).astype(np.intp)
-    return pixel, inside, u - column, v - row
+    return pixel, inside, np.stack([(u - column).take(inside), (v - row).take(inside)], axis=1)
 
 
 def _color_rows(p: Float, intensity: Float, texture: Float, fx: float, fy: float) -> Rows:
@@ -189,23 +162,16 @@ def _robust(r: Float, floor: float, bias: Float | float = 0.0) -> Float:
 
 def normal_equations(partners: Partners, T_world_target: Float) -> tuple[Float, Float]:
     """(6, 6) H and (6,) g of Σ w r² for a left twist (rotation, translation) of the source in the world."""
-    H, g = _accumulate(partners.shape, shape_weights(partners.shape), T_world_target)
+    H, g = _summed(partners.shape, shape_weights(partners.shape), T_world_target)
     if partners.color is not None and len(partners.color.residual) >= MIN_PARTNERS:
-        h, b = _accumulate(partners.color, _robust(partners.color.residual, INTENSITY_FLOOR), T_world_target)
+        h, b = _summed(partners.color, _robust(partners.color.residual, INTENSITY_FLOOR), T_world_target)
         H, g = H + h, g + b
     return H, g
 
 
-def _accumulate(rows: Rows, w: Float, T_world_target: Float) -> tuple[Float, Float]:
-    R = T_world_target[:3, :3]
-    x, n = R @ rows.points + T_world_target[:3, 3:], R @ rows.directions
-    J = np.empty((6, x.shape[1]))
-    J[0] = x[1] * n[2] - x[2] * n[1]
-    J[1] = x[2] * n[0] - x[0] * n[2]
-    J[2] = x[0] * n[1] - x[1] * n[0]
-    J[3:] = n
-    Jw = J * w
-    return Jw @ J.T, Jw @ rows.residual
+def _summed(rows: Rows, weight: Float, T_world_target: Float) -> tuple[Float, Float]:
+    H, g = add_up(rows.points, rows.directions, rows.residual, weight, T_world_target)
+    return H, g
 
 
 def register_view(
