@@ -22,7 +22,7 @@ from thermofusion.geometry.mesh import (
     triangle_normals,
     vertex_areas,
 )
-from thermofusion.geometry.normals import window_normals
+from thermofusion.geometry.normals import plane_normals, window_normals
 from thermofusion.recipe import load_recipe
 from thermofusion.surface import surface as fusion
 from thermofusion.surface.clean import subject_only
@@ -395,6 +395,22 @@ def test_pieces_areas_and_smoothing(ball) -> None:
     error = [np.abs(np.linalg.norm(x, axis=1) - 0.15) for x in (kept, smooth)]
     assert error[1].mean() < 0.9 * error[0].mean()
     assert np.linalg.norm(smooth, axis=1).mean() == pytest.approx(0.15, abs=0.2e-3)  # Taubin does not shrink
+
+
+def test_planes_are_those_of_all_points_within_the_radius() -> None:
+    """Against eigenvectors of the scatter of the points themselves; a far point makes no plane, nor a large table."""
+    rng = np.random.default_rng(4)
+    points = rng.uniform(-0.5, 0.5, (400, 3)) * [0.1, 0.1, 0.03]
+    points = np.vstack([points, [[2e3, 0.0, 0.0]]]).astype(np.float32)
+    normals = plane_normals(points, 0.02)
+    x = points.astype(np.float64)
+    for i in range(400):
+        near = x[((x - x[i]) ** 2).sum(1) <= 0.02**2]
+        _, spread, axes = np.linalg.svd(near - near.mean(0), full_matrices=False)
+        if len(near) >= 4 and spread[1] > 2 * spread[2]:
+            assert abs(normals[i] @ axes[2]) > 1 - 1e-6
+    assert np.isnan(normals[400]).all()
+    assert plane_normals(points[:0], 0.02).shape == (0, 3)
 
 
 def test_window_normals_of_two_near_surfaces_do_not_mix() -> None:

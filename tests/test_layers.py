@@ -40,7 +40,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "robust": ("types", "errors"),
     "files": ("types", "errors", "version"),
     "recipe": ("errors", "files"),
-    "geometry": ("types", "errors", "robust"),
+    "geometry": ("types", "errors", "compiled", "robust"),
     "physics": ("types", "errors", "recipe"),
     "scans": (*BASE, "physics"),
     "depth": BASE,
