@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from thermofusion.depth.filter import DepthFrames, DepthUndistorter, filter_depth
+from thermofusion.depth.loops import blot_out, cell_means, coarser, from_steps, in_steps, near_enough
 from thermofusion.geometry.camera import pixel_rays
 from thermofusion.recipe import InputSection
 from thermofusion.types import Camera, Rig, Scan, Stream
@@ -114,3 +115,59 @@ def test_frames_come_in_order_and_filtered() -> None:
     assert [i for i, _ in got] == [6, 0, 3, 2]
     for i, depth in got:
         np.testing.assert_array_equal(depth, filter_depth(images[i], CAMERA, SECTION))
+
+
+# ---------------------------------------------------------------- compiled loops against whole arrays
+
+
+def rough(seed, shape=(37, 53)):
+    """Depth of two surfaces with steps, noise and holes."""
+    rng = np.random.default_rng(seed)
+    depth = np.where(rng.random(shape) < 0.5, 1.0, 1.4) + rng.normal(0, 0.004, shape)
+    depth[rng.random(shape) < 0.2] = np.nan
+    return np.round(depth, 3).astype(np.float32)
+
+
+def test_pixels_with_enough_neighbours_are_kept():
+    depth = rough(0)
+    kept, top, bottom, left, right = near_enough(depth, 0.99, 1.402, 0.006, 3)
+    inside = np.where((depth >= np.float32(0.99)) & (depth <= np.float32(1.402)), depth, np.float32(np.nan))
+    near = np.zeros(depth.shape, int)
+    for dv, du in ((0, 1), (1, -1), (1, 0), (1, 1)):
+        there = np.full_like(inside, np.nan)
+        there[: len(depth) - dv, max(0, -du) : 53 - max(0, du)] = inside[dv:, max(0, du) : 53 + min(0, du)]
+        close = np.abs(inside - there) < inside * inside * np.float32(0.006)
+        near += close
+        near[dv:, max(0, du) : 53 + min(0, du)] += close[: len(depth) - dv, max(0, -du) : 53 - max(0, du)]
+    np.testing.assert_array_equal(kept, np.where(near >= 3, inside, np.nan))
+    rows, columns = (np.flatnonzero(np.isfinite(inside).any(k)) for k in (1, 0))
+    assert (top, bottom, left, right) == (rows[0], rows[-1] + 1, columns[0], columns[-1] + 1)
+
+
+def test_cells_of_pixels_have_their_means():
+    depth = rough(1)
+    depth[:, 20:] = np.where(np.isnan(depth[:, 20:]), np.nan, 1.2)
+    whole = depth[:36, :52].reshape(9, 4, 13, 4).swapaxes(1, 2).reshape(9, 13, 16)
+    count = np.isfinite(whole).sum(2)
+    mean = cell_means(np.where(np.arange(53) < 52, depth, np.nan)[:36], 4, 0.25)[:, :13]
+    np.testing.assert_allclose(mean, np.where(count > 4, np.nanmean(1 / whole, axis=2), np.nan), rtol=1e-5)
+    assert cell_means(depth, 4, 0.25).shape == (10, 14)
+    even = (2 * count >= 16) & (np.nanmax(whole, 2) - np.nanmin(whole, 2) < 0.03 * np.nanmin(whole, 2))
+    assert even.any()
+    np.testing.assert_allclose(coarser(depth, 4, 0.03), np.where(even, np.nanmean(whole, axis=2), np.nan), rtol=1e-6)
+    cell = count > 12
+    blotted = depth.copy()
+    blot_out(blotted[:36, :52], cell, 4)
+    np.testing.assert_array_equal(
+        np.isnan(blotted[:36, :52]), np.isnan(depth[:36, :52]) | np.kron(cell, np.ones((4, 4), bool))
+    )
+
+
+def test_a_kept_image_comes_back_to_the_last_bit():
+    steps = np.random.default_rng(2).integers(0, 65536, (8, 9)).astype(np.uint16)
+    depth = np.where(steps > 0, steps.astype(np.float32) * np.float32(0.001), np.float32(np.nan))
+    kept, again = np.empty((8, 9), np.uint16), np.empty((8, 9), np.float32)
+    assert in_steps(depth, 0.001, kept)
+    from_steps(kept, 0.001, again)
+    np.testing.assert_array_equal(again, depth)
+    assert not in_steps(depth + np.float32(3e-4), 0.001, kept)

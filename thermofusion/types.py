@@ -24,6 +24,7 @@ Float32 = NDArray[np.float32]
 Int = NDArray[np.int32]
 Bool = NDArray[np.bool_]
 UInt8 = NDArray[np.uint8]
+UInt16 = NDArray[np.uint16]
 
 RIGID_TOLERANCE = 1e-4  # deviation of RᵀR from identity: hand-typed extrinsics carry 5-6 digits
 

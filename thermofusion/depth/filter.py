@@ -1,6 +1,6 @@
 """Which depth is believed: range, grazing incidence, flying pixels; and depth images freed of lens distortion.
 
-Pure NumPy and OpenCV, no Open3D, no files. Tracking and fusion both look at depth through `DepthFrames`.
+No Open3D, no files. Tracking and fusion both look at depth through `DepthFrames`.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 from typing import TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.camera import distort
 from ..recipe import InputSection
 from ..types import Bool, Camera, Float32, Scan
+from .loops import blot_out, cell_means, from_steps, in_steps, near_enough
 
 MIN_NEIGHBOURS = 3  # of 8: what the corner of a surface still has, and a one-pixel veil between two surfaces has not
 CELL_PX = 4  # slopes are taken between means over squares of this size: single pixels carry only noise
@@ -39,14 +39,13 @@ def filter_depth(depth_m: Float32, camera: Camera, section: InputSection) -> Flo
 
     The camera's lens distortion is neglected in the angle (a degree at most); see `DepthUndistorter` for the pixels.
     """
-    depth = np.where((depth_m >= section.min_depth_m) & (depth_m <= section.max_depth_m), depth_m, np.float32(np.nan))
-    box = bounding_box(depth)
-    if box is None:
-        return depth
-    part = depth[box]
-    part[_flying(part, section.flying_pixel_mm * 1e-3)] = np.nan
-    if section.max_grazing_deg < 90:
-        part[_grazing(part, camera, box, float(np.cos(np.radians(section.max_grazing_deg))))] = np.nan
+    limits = section.min_depth_m, section.max_depth_m, section.flying_pixel_mm * 1e-3, MIN_NEIGHBOURS
+    depth: Float32
+    depth, top, bottom, left, right = near_enough(depth_m, *limits)
+    if bottom > top and section.max_grazing_deg < 90:
+        box = slice(top, bottom), slice(left, right)
+        oblique = _oblique(depth[box], camera, box, float(np.cos(np.radians(section.max_grazing_deg))))
+        blot_out(depth[box], oblique, CELL_PX)
     return depth
 
 
@@ -59,46 +58,21 @@ def bounding_box(depth: Float32) -> tuple[slice, slice] | None:
     return slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1)
 
 
-def _flying(depth: Float32, step_at_1m: float) -> Bool:
-    """Pixels without enough neighbours at their own depth."""
-    near = np.zeros(depth.shape, np.uint8)
-    step = depth * depth
-    step *= np.float32(step_at_1m)
-    h, w = depth.shape
-    for dv, du in ((0, 1), (1, -1), (1, 0), (1, 1)):  # half of the neighbours; each pair counts for both its pixels
-        here = np.s_[: h - dv, max(0, -du) : w - max(0, du)]
-        there = np.s_[dv:, max(0, du) : w + min(0, du)]
-        close = (np.abs(depth[here] - depth[there]) < step[here]).view(np.uint8)  # NaN compares False
-        near[here] += close
-        near[there] += close
-    return near < MIN_NEIGHBOURS
-
-
-def _grazing(depth: Float32, camera: Camera, box: tuple[slice, slice], min_cos: float) -> Bool:
-    """Pixels whose surface is turned away by more than arccos(min_cos) from the pixel's ray.
+def _oblique(depth: Float32, camera: Camera, box: tuple[slice, slice], min_cos: float) -> Bool:
+    """Cells of pixels whose surface is turned away by more than arccos(min_cos) from their rays.
 
     On a plane A X + B Y + C Z = 1 the inverse depth is linear over the image, 1/z = A x + B y + C, so two slopes of the
-    inverse depth, averaged over cells, give the normal (A, B, C), and cosθ = (1/z) / (|n| |(x, y, 1)|). The verdict
-    holds for the whole cell.
+    inverse depth, averaged over cells, give the normal (A, B, C), and cosθ = (1/z) / (|n| |(x, y, 1)|).
     """
-    h, w = depth.shape
-    pad = (-h % CELL_PX, -w % CELL_PX)
-    inverse = np.nan_to_num(np.reciprocal(depth), copy=False)
-    inverse = cv2.copyMakeBorder(inverse, 0, pad[0], 0, pad[1], cv2.BORDER_CONSTANT)
-    grid = (inverse.shape[1] // CELL_PX, inverse.shape[0] // CELL_PX)
-    weight = cv2.resize((inverse > 0).astype(np.float32), grid, interpolation=cv2.INTER_AREA)
-    cell = cv2.resize(inverse, grid, interpolation=cv2.INTER_AREA)
-    mean: Float32 = np.divide(cell, weight, out=np.full_like(cell, np.nan), where=weight > MIN_CELL_SHARE)
-
+    mean: Float32 = cell_means(depth, CELL_PX, MIN_CELL_SHARE)
+    rows, columns = mean.shape
     K = camera.K.astype(np.float32)
-    middle = CELL_PX * np.arange(max(grid), dtype=np.float32) + np.float32((CELL_PX - 1) / 2)
-    x = ((middle[None, : grid[0]] + box[1].start) - K[0, 2]) / K[0, 0]
-    y = ((middle[: grid[1], None] + box[0].start) - K[1, 2]) / K[1, 1]
+    middle = CELL_PX * np.arange(max(mean.shape), dtype=np.float32) + np.float32((CELL_PX - 1) / 2)
+    x = ((middle[None, :columns] + box[1].start) - K[0, 2]) / K[0, 0]
+    y = ((middle[:rows, None] + box[0].start) - K[1, 2]) / K[1, 1]
     A, B = _slope(mean) * K[0, 0], _slope(mean.T).T * K[1, 1]
     C = mean - A * x - B * y
-    oblique = mean**2 < min_cos**2 * (A**2 + B**2 + C**2) * (1 + x**2 + y**2)  # no slope (NaN) = no verdict
-    full = cv2.resize(oblique.view(np.uint8), inverse.shape[::-1], interpolation=cv2.INTER_NEAREST)
-    return full[:h, :w].view(np.bool_)
+    return np.asarray(mean**2 < min_cos**2 * (A**2 + B**2 + C**2) * (1 + x**2 + y**2))  # no slope (NaN) = no verdict
 
 
 def _slope(cell: Float32) -> Float32:
@@ -166,7 +140,7 @@ class DepthFrames:
         self._undistort = DepthUndistorter(scan.rig.depth)
         self.camera = self._undistort.camera
         self._room_bytes = keep_bytes
-        self._kept: dict[int, tuple[tuple[slice, slice], Float32]] = {}  # the part of each that holds depth
+        self._kept: dict[int, tuple[tuple[slice, slice], NDArray]] = {}  # the part of each that holds depth
 
     def __len__(self) -> int:
         return len(self._stream)
@@ -187,14 +161,19 @@ class DepthFrames:
     def load(self, i: int) -> Float32:
         """Frame i: (H, W) float32 metres, NaN = none. Raises ScanError naming the file if it cannot be read."""
         if i in self._kept:
-            box, part = self._kept[i]
+            box, kept = self._kept[i]
             depth: Float32 = np.full(self.camera.shape, np.nan, np.float32)
-            depth[box] = part
+            if kept.dtype == np.float32:
+                depth[box] = kept
+            else:
+                from_steps(kept, self._unit_m, depth[box])
             return depth
         depth = filter_depth(self._undistort(self._stream.load(i)), self.camera, self._section)
         if self._room_bytes > 0 and (found := bounding_box(depth)) is not None:
-            self._kept[i] = found, depth[found].copy()
-            self._room_bytes -= self._kept[i][1].nbytes
+            steps = np.empty(depth[found].shape, np.uint16)  # as images are recorded: half the memory
+            part: NDArray = steps if in_steps(depth[found], self._unit_m, steps) else depth[found].copy()
+            self._kept[i] = found, part
+            self._room_bytes -= part.nbytes
         return depth
 
     def read_ahead(self, frames: Sequence[int]) -> Iterator[tuple[int, Float32]]:

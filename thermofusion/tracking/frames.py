@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..depth.filter import DepthFrames, bounding_box, read_ahead
+from ..depth.filter import DepthFrames, read_ahead
+from ..depth.loops import coarser
 from ..depth.subject import SubjectFrames
 from ..geometry.camera import project
 from ..geometry.rigid import transform_points
@@ -138,25 +139,7 @@ def coarse_depth(depth_m: Float32, step: int) -> Float32:
 
     NaN where less than half of a cell is valid or two surfaces meet.
     """
-    if step == 1:
-        return depth_m
-    whole = np.full([n // step for n in depth_m.shape], np.nan, np.float32)
-    box = bounding_box(depth_m)
-    if box is None:
-        return whole
-    cells = tuple(slice(of.start // step, min(-(-of.stop // step), n)) for of, n in zip(box, whole.shape, strict=True))
-    inside = depth_m[tuple(slice(of.start * step, of.stop * step) for of in cells)]
-    parts = [inside[r::step, c::step] for r in range(step) for c in range(step)]
-    total, count = np.zeros_like(parts[0]), np.zeros(parts[0].shape, np.uint8)
-    low, high = parts[0], parts[0]
-    for part in parts:
-        valid = part == part  # False where NaN
-        total += np.where(valid, part, np.float32(0))
-        count += valid
-        low, high = np.fmin(low, part), np.fmax(high, part)
-    good = (2 * count >= len(parts)) & (high - low < np.float32(CELL_SPREAD) * low)
-    np.divide(total, count, out=whole[cells], where=good)
-    return whole
+    return depth_m if step == 1 else np.asarray(coarser(depth_m, step, CELL_SPREAD))
 
 
 def local_contrast(grey: Float32, step: int) -> Float32:
