@@ -86,6 +86,7 @@ def test_pins_are_found_without_picks(detected, picked):
     board = detected.calibration.data.board
     assert sum(len(board) - len(r) > 60 for r in detected.rejected_px["thermal"].values()) >= 16
     assert not any("interpolated" in text for text in detected.advice)
+    assert any("in one housing they stand side by side" in note for note in detected.calibration.notes)
     hand = {v.name: v.points["thermal"] for v in picked.calibration.data.views if "thermal" in v.points}
     apart = []
     for name in sorted(hand.keys() & views.keys()):

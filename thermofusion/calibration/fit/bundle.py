@@ -183,6 +183,11 @@ class Problem:
 
     # ------------------------------------------------------------ residuals
 
+    def row_views(self) -> np.ndarray:
+        """(D,) number of the view of each data residual, as `linearise` orders them."""
+        parts = [np.repeat(block.view, 2) for block in self.points]
+        return np.concatenate(parts if self.depth is None else [*parts, self.depth.view])
+
     def point_residuals(self, block: _PointBlock, x: Float) -> tuple[Float, Float, np.ndarray]:
         """(N, 2) projected minus seen [px] at parameters x (P,); the Jacobian's values (N, 2, 16 or 22) and columns."""
         scale, pose = np.exp(x[self.slices["spacing"]][0]), self._board_poses(x)

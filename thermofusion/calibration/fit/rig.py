@@ -22,6 +22,7 @@ from .single import SingleFit, fit_camera
 from .solver import Fit, solve
 from .start import board_pose
 
+HOUSING_M, BESIDE_M = 0.08, 0.01  # lenses of one housing stand this close, and level to this
 STEP = 1e-6  # rad and m, of derivatives by differences
 
 
@@ -100,7 +101,7 @@ def calibrate_views(
         start = DepthStart(depth_images, model, depth_camera, depth_lens_known, T, free_spacing, lens, T)
         fit, more = add_depth(fit, single, start)
         held = held + more
-    return _assemble(fit, single, grouping, group, (*notes, *held))
+    return _assemble(fit.resampled()[0], single, grouping, group, (*notes, *held))
 
 
 def _refuse_mirrored_pairs(single: dict[str, SingleFit]) -> None:
@@ -159,9 +160,22 @@ def _assemble(
     s = problem.slices["spacing"].start
     spacing = problem.data.board.spacing_m * float(np.exp(fit.x[s]))
     sigma = spacing * float(np.sqrt(fit.covariance[s, s]))
+    notes = (*notes, *_implausible(extrinsics))
     if not fit.converged:
         notes = (f"the joint fit did not converge ({fit.message})", *notes)
     return Calibration(fit, single, grouping, chosen, lenses, extrinsics, covariances, spacing, sigma, notes)
+
+
+def _implausible(extrinsics: dict[str, Float]) -> list[str]:
+    """A colour camera that stands beside the depth camera, as in one housing, but before or behind it."""
+    T = extrinsics.get("T_color_depth")
+    if T is None or np.linalg.norm(T[:2, 3]) > HOUSING_M or abs(T[2, 3]) < BESIDE_M:
+        return []
+    where = "behind" if T[2, 3] > 0 else "before"
+    return [
+        f"the colour lens comes out {abs(T[2, 3]) * 1e3:.0f} mm {where} the depth lens: in one housing they stand side "
+        "by side, and depth may be off by as much, which sigma does not hold; infrared pictures of the board settle it"
+    ]
 
 
 def predict_px(
