@@ -23,7 +23,7 @@ from .gauge import common_motion, poses_without, unsteady, without
 from .graph import Binding, NodeGraph, bind, build_graph, cells
 from .rest import unrest
 from .rows import CORRELATED, CoarseFrames, LeftOver, Normal, gather, jacobian, left_over
-from .solve import edge_matrix, held_matrix, solve_motion, step_weights
+from .solve import Steps, edge_matrix, held_matrix, solve_motion
 
 SPACING_M = 0.15  # of nodes: rigid pieces of this size leave 0.34 mm of a body's sway, breath and drifting arms
 POINTS_M, LOOK_M = 0.02, 0.025  # of the points that are compared with frames, and of those that tell whether to
@@ -138,9 +138,8 @@ class _State:
         J = jacobian(points, field.node_m)
         rest = replace(self.graph, at_m=field.node_m)
         held = held_matrix(rest, edge_matrix(rest))
-        solved = solve_motion(
-            sums, Normal.of(J), J, field.twist, held, step_weights(field.knot_s, field.twist), 1 / CORRELATED
-        )
+        slow = Steps.of(rest, field.knot_s, field.twist)
+        solved = solve_motion(sums, Normal.of(J), J, field.twist, held, slow, 1 / CORRELATED)
         shift = np.clip(solved.shape_m, -MAX_SHIFT_M, MAX_SHIFT_M).astype(np.float32)
         points = replace(points, at_m=points.at_m + shift[:, None] * points.normal)
         T = se3_exp(unsteady(field, frames.times_s, steps)) @ frames.T_world_depth

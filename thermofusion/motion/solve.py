@@ -13,16 +13,17 @@ from ..types import Float, Float32
 from .graph import NodeGraph
 from .rows import Normal, Sums
 
-STRETCH_M, BEND_RAD = 4e-3, np.radians(3.4)  # between neighbours, one sigma: a joint between them must be able to bend
-STEP_M, STEP_RAD = 6e-3, np.radians(1.1)  # in `STEP_S`, one sigma
+STRETCH_M, BEND_RAD = 6e-3, np.radians(5.0)  # between neighbours, one sigma: a joint between them must be able to bend
+STRETCH_STEP_M, BEND_STEP_RAD = 1.5e-3, np.radians(0.3)  # of what a joint changes in `STEP_S`: it bends slowly
+STEP_M, STEP_RAD = 8e-3, np.radians(1.6)  # in `STEP_S`, one sigma
 STEP_S = 0.67
-JUMP_SIGMAS = 6.0  # of a step, turn and shift together
+JUMP_SIGMAS = 2.5  # of a step, turn and shift together
 SHAPE_M = 20e-3  # of the surface's error along its normal
 CG_STEPS, CG_TOLERANCE = 30, 0.02
 REST_M, REST_RAD = 40e-3, np.radians(9)  # towards rest
 
 
-def edge_matrix(graph: NodeGraph) -> Float:
+def edge_matrix(graph: NodeGraph, stretch_m: float = STRETCH_M, bend_rad: float = BEND_RAD) -> Float:
     """Rows (E, 9, 12) that hold two neighbours k, l together, over (ω_k, t_k, ω_l, t_l), in sigmas.
 
     Where l would be if it hung rigidly on k, against where it is (3); the same with k on l (3); ω_k - ω_l (3). To first
@@ -32,11 +33,11 @@ def edge_matrix(graph: NodeGraph) -> Float:
     d = graph.at_m[b] - graph.at_m[a]
     rows = np.zeros((len(d), 9, 12))
     eye = np.eye(3)
-    rows[:, :3, :3] = -_cross(d) / STRETCH_M  # ω x d = -[d]x ω
-    rows[:, :3, 3:6], rows[:, :3, 9:] = eye / STRETCH_M, -eye / STRETCH_M
-    rows[:, 3:6, 6:9] = _cross(d) / STRETCH_M  # seen from b: ω_b x (-d) + t_b - t_a
-    rows[:, 3:6, 9:], rows[:, 3:6, 3:6] = eye / STRETCH_M, -eye / STRETCH_M
-    rows[:, 6:, :3], rows[:, 6:, 6:9] = eye / BEND_RAD, -eye / BEND_RAD
+    rows[:, :3, :3] = -_cross(d) / stretch_m  # ω x d = -[d]x ω
+    rows[:, :3, 3:6], rows[:, :3, 9:] = eye / stretch_m, -eye / stretch_m
+    rows[:, 3:6, 6:9] = _cross(d) / stretch_m  # seen from b: ω_b x (-d) + t_b - t_a
+    rows[:, 3:6, 9:], rows[:, 3:6, 3:6] = eye / stretch_m, -eye / stretch_m
+    rows[:, 6:, :3], rows[:, 6:, 6:9] = eye / bend_rad, -eye / bend_rad
     return rows
 
 
@@ -60,15 +61,53 @@ def held_matrix(graph: NodeGraph, rows: Float) -> Float:
     return H.transpose(0, 2, 1, 3).reshape(6 * k, 6 * k)
 
 
-def step_weights(knot_s: Float, twist: Float) -> Float:
-    """(F-1, K, 6) weights of the nodes' steps between knots knot_s (F,): a random walk's, robust about twist (F, K, 6).
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """How slowly the nodes move from knot to knot, and how slowly what joins neighbours changes: what is out of view
+    goes on hanging on what is seen.
 
-    A foot that is set aside pays once: a step larger than `JUMP_SIGMAS` counts less and less (Cauchy).
+    node : (F-1, 6K) weights of the nodes' steps, a random walk's. joint : (F-1,) weights of `normal` (6K, 6K), the
+    joints' own.
     """
-    unit = np.array([STEP_RAD**-2.0] * 3 + [STEP_M**-2.0] * 3)
-    weight = (STEP_S / np.diff(knot_s))[:, None, None] * unit
-    size2 = (weight * np.diff(twist, axis=0) ** 2).sum(2, keepdims=True)
-    return weight / (1 + size2 / JUMP_SIGMAS**2)
+
+    node: Float
+    joint: Float
+    normal: Float
+
+    @classmethod
+    def of(cls, graph: NodeGraph, knot_s: Float, twist: Float) -> Steps:
+        """Between knots knot_s (F,), robust about twist (F, K, 6)."""
+        E, K = len(graph.edge), len(graph)
+        step = np.diff(twist, axis=0)
+        share = STEP_S / np.diff(knot_s)
+        node = share[:, None, None] * np.array([STEP_RAD**-2.0] * 3 + [STEP_M**-2.0] * 3)
+        rows = edge_matrix(graph, STRETCH_STEP_M, BEND_STEP_RAD)
+        place = (6 * graph.edge[:, :, None] + np.arange(6)).reshape(E, 1, 12).repeat(9, axis=1)
+        R = csr_matrix((rows.ravel(), place.ravel(), np.arange(0, 108 * E + 1, 12)), shape=(9 * E, 6 * K))
+        bent = (R @ step.reshape(-1, 6 * K).T).T.reshape(-1, E, 9)
+        jump = unless_jump((node * step**2).sum(2))
+        node = (node * jump[:, None, None]).repeat(K, axis=1).reshape(-1, 6 * K)
+        joint = share * unless_jump(share[:, None] * (bent**2).sum(2))
+        return cls(node, joint, (R.T @ R).toarray())
+
+    def pull(self, step: Float) -> Float:
+        """(F-1, 6K) of steps (F-1, 6K): their weights' matrices times them."""
+        return np.asarray(self.node * step + self.joint[:, None] * (step @ self.normal))
+
+    def at(self, knot: int) -> Float:
+        """(6K, 6K) matrix of the step from a knot to the next; 0 before the first and after the last."""
+        if not 0 <= knot < len(self.node):
+            return np.zeros_like(self.normal)
+        return np.asarray(np.diag(self.node[knot]) + self.joint[knot] * self.normal)
+
+
+def unless_jump(size2: Float) -> Float:
+    """(F-1,) weights of steps between knots from their squared sizes (F-1, N), in sigmas, of nodes or joints.
+
+    A foot that is set aside pays once, and what hangs on it, seen or not, goes with it: where one of them jumps beyond
+    `JUMP_SIGMAS`, none is held (Geman-McClure).
+    """
+    return np.asarray((1 + size2.max(axis=1) / JUMP_SIGMAS**2) ** -2.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,19 +121,18 @@ class Solved:
 
 
 def solve_motion(
-    sums: Sums, normal: Normal, J: csr_matrix, twist: Float, held: Float, steps: Float, share: float
+    sums: Sums, normal: Normal, J: csr_matrix, twist: Float, held: Float, steps: Steps, share: float
 ) -> Solved:
     """One Gauss-Newton step of motion and shape together: data (weights times `share`), held, steps.
 
     J : (P, 6K) of the points' motion along their normals. twist : (F, K, 6) before, rad and m. held : (6K, 6K) of
-    neighbours and rest. steps : (F-1, K, 6) weights between knots.
+    neighbours and rest. steps : what holds knots together.
 
     Shape, one number a point, is eliminated: what all frames say of a point in common is no motion. That couples all
     knots, so the system is solved by conjugate gradients, with the motion alone (block tridiagonal) as preconditioner.
     """
     F, m = len(twist), twist.shape[1] * 6
     old = twist.reshape(F, m)
-    flat = steps.reshape(-1, m)
     seen = sums.own.copy()  # (F, P) a point's weight at each knot
     seen[:-1] += sums.next
     seen[1:] += sums.next
@@ -109,20 +147,16 @@ def solve_motion(
 
     def regular(x: Float) -> Float:
         z = x @ held
-        step = flat * np.diff(x, axis=0)
+        step = steps.pull(np.diff(x, axis=0))
         z[1:] += step
         z[:-1] -= step
         return z
 
     def own(f: int) -> Float:
-        H = normal.matrix(share * sums.own[f]) + held
-        H[np.diag_indices(m)] += flat[max(f - 1, 0) : f + 1].sum(0)
-        return H
+        return normal.matrix(share * sums.own[f]) + held + steps.at(f - 1) + steps.at(f)
 
     def after(f: int) -> Float:
-        H = normal.matrix(share * sums.next[f])
-        H[np.diag_indices(m)] -= flat[f]
-        return H
+        return normal.matrix(share * sums.next[f]) - steps.at(f)
 
     factored = Tridiagonal.of(F, own, after)
     pull = share * (sums.pull - seen / share * (sums.weight * sums.residual * share / total))
