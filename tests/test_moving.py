@@ -18,13 +18,13 @@ from thermofusion.geometry.rigid import invert, se3_exp, transform_points
 from thermofusion.motion.body import moved_by
 from thermofusion.motion.coarse import clear_of_edges
 from thermofusion.motion.estimate import STILL, Solution, estimate, look_points
-from thermofusion.motion.field import MotionField, affine, displacement, rotations
+from thermofusion.motion.field import BoundPoints, MotionField, affine, displacement, rotations
 from thermofusion.motion.gauge import common_motion, poses_without, without
 from thermofusion.motion.graph import MAX_NODES, bind, build_graph
 from thermofusion.motion.parts import name_parts
 from thermofusion.motion.rest import unrest
-from thermofusion.motion.rows import CoarseFrames, LeftOver
-from thermofusion.motion.solve import Tridiagonal
+from thermofusion.motion.rows import CoarseFrames, LeftOver, Normal, Sums, jacobian
+from thermofusion.motion.solve import Steps, Tridiagonal, edge_matrix, held_matrix, solve_motion
 from thermofusion.motion.told import amplitudes, described, joined, ranges
 from thermofusion.motion.warp import RestSurface, Warp
 from thermofusion.phantom.scene import ShapeConfig
@@ -88,6 +88,49 @@ def test_a_block_tridiagonal_system_is_solved_as_dense_algebra_does():
     b = rng.normal(size=(F, m))
     x = Tridiagonal.of(F, lambda f: own[f], lambda f: after[f]).solve(b)
     np.testing.assert_allclose(x.ravel(), np.linalg.solve(dense, b.ravel()), rtol=2e-4, atol=1e-6)
+
+
+def test_what_holds_knots_together_knows_no_rigid_motion_of_joints_and_lets_jumps_pass(body):
+    graph = build_graph(body.vertices_m, body.triangles, 0.15)
+    knots = np.arange(4) * 0.67
+    turn = np.array([0.002, -0.001, 0.003])
+    rigid = np.concatenate([np.tile(turn, (len(graph), 1)), np.cross(turn, graph.at_m)], axis=1)
+    twist = np.zeros((4, len(graph), 6))
+    twist[1:] = rigid
+    twist[3:, 0, 3] += 0.032  # four sigmas
+    steps = Steps.of(graph, knots, twist)
+    step = np.diff(twist.reshape(4, -1), axis=0)
+    pull = steps.pull(step)
+    np.testing.assert_allclose(pull[0], steps.node[0] * step[0], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(pull[2], steps.at(2) @ step[2], rtol=1e-9)
+    np.testing.assert_allclose(steps.node[2] / steps.node[1], (1 + (4 / 2.5) ** 2) ** -2, rtol=1e-6)
+    assert not steps.at(-1).any()
+    assert not steps.at(3).any()
+
+
+def test_what_is_never_seen_goes_with_what_it_hangs_on(body):
+    """The lower part of a body turns at once by 2°; its last 25 cm are not seen."""
+    graph = build_graph(body.vertices_m, body.triangles, 0.15)
+    at, knots = graph.at_m, np.arange(12) * 0.67
+    hinge = np.array([0, 0, at[:, 2].min() + 0.6])
+    low = np.clip((hinge[2] - at[:, 2]) / 0.1, 0, 1)[:, None]
+    turn = np.array([np.radians(2.0), 0, 0])
+    moved = np.concatenate([low * turn, low * np.cross(turn, at - hinge)], axis=1)
+    truth = np.where(np.arange(12)[:, None, None] < 6, -0.5, 0.5) * moved
+    pick = look_points(body, 0.02)
+    points = BoundPoints(body.vertices_m[pick], body.normals[pick], graph.binding.take(pick))
+    J = jacobian(points, at)
+    end = at[:, 2] < at[:, 2].min() + 0.25
+    weight = np.where(points.at_m[:, 2] > points.at_m[:, 2].min() + 0.25, 10 / 0.003**2, 0.0)
+    own, twist = np.tile(weight, (12, 1)), np.zeros_like(truth)
+    held = held_matrix(graph, edge_matrix(graph))
+    for _ in range(6):
+        r = (J @ (truth - twist).reshape(12, -1).T).T
+        sums = Sums(own, np.zeros((11, len(pick))), own * r, own.sum(0), r.mean(0), 1.0, 1.0)
+        slow = Steps.of(graph, knots, twist)
+        twist = solve_motion(sums, Normal.of(J), J, twist, held, slow, 0.2).twist
+    found, true = twist[:, end, 3:], truth[:, end, 3:]
+    assert np.sqrt(((found - true) ** 2).sum(2).mean()) < 0.17 * np.sqrt((true**2).sum(2).mean())
 
 
 def test_a_rigid_motion_of_all_nodes_is_the_cameras(body):

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 # A stage is handed exactly the recipe sections that its key holds. It also depends on all stages before it.
 STAGES = (
     Stage("tracking", ("input", "subject", "tracking"), edition=3),
-    Stage("surface", ("input", "subject", "surface"), edition=7),
+    Stage("surface", ("input", "subject", "surface"), edition=8),
     Stage("rig", ("input", "rig"), edition=6),
     Stage("mapping", ("input", "mapping"), edition=12),
     Stage("temperature", ("mapping", "temperature"), edition=17, handed_out=RESULT),

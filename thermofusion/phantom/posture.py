@@ -22,7 +22,8 @@ ANKLE_Z, CHEST_Z, BELLY_Z = 0.08, 1.25, 1.05  # m, of a body of 1.75 m
 WAVES = 5  # sines of every drift
 SPAN = 5.5  # of a drift from end to end, in its rms
 STEP_S = 1.0  # in which a foot is set aside, in the middle of the recording
-TRUNK_Z = (0.85, 1.40)  # m, what the trunk's rigid motion is fitted to, at the back: breath is no motion of the trunk
+TRUNK_Z = (0.85, 1.40)  # m, what the trunk's rigid motion is fitted to
+TRUNK_OWN = 1e-3  # of the weights of moving parts: breath is no motion of the trunk
 MIDLINE_M = 0.13  # half a trunk's width
 PART_FROM_Z = (1.50, 1.22, 1.02, 0.83)  # m: where head, chest, belly and pelvis begin
 LEG_FROM_Z = (0.50, 0.09)  # m: where thigh and shin begin
@@ -197,7 +198,7 @@ def _weights(p: Float, mesh: Mesh) -> dict[str, Float]:
     out["ankle"] = np.clip((p[:, 2] - ANKLE_Z) / 0.06 + 0.5, 0, 1)
     side = np.clip((p[:, 0] - 0.02) / 0.04, 0, 1)
     out["leg"] = side * np.clip((0.92 - p[:, 2]) / 0.15, 0, 1) * (arms < 0.5)
-    back = p[:, 1] > np.median(p[:, 1])
-    inside = back & (np.abs(p[:, 0]) < MIDLINE_M) & (p[:, 2] > TRUNK_Z[0]) & (p[:, 2] < TRUNK_Z[1]) & (arms < 0.01)
-    out["trunk"] = inside.astype(np.float64)
+    own = np.max([arms, out["chest"], out["belly"], out["leg"], out["head"]], axis=0)
+    inside = (np.abs(p[:, 0]) < MIDLINE_M) & (p[:, 2] > TRUNK_Z[0]) & (p[:, 2] < TRUNK_Z[1])
+    out["trunk"] = (inside & (own < TRUNK_OWN)).astype(np.float64)
     return out
