@@ -5,8 +5,10 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import shutil
 import subprocess
+from dataclasses import replace
 from hashlib import sha256
 from html.parser import HTMLParser
 
@@ -18,7 +20,8 @@ from support.result_maker import result, sphere
 from thermofusion.export import palettes
 from thermofusion.geometry.rays import RayScene
 from thermofusion.recipe import Recipe
-from thermofusion.regions import Brush, Measured, Measurer, Spot, read_regions, write_regions
+from thermofusion.regions import Brush, Difference, Measured, Measurer, Spot, read_regions, write_regions
+from thermofusion.report.deidentify import deidentified
 from thermofusion.report.html import TEMPLATE, Reported, write_report
 from thermofusion.temperature.solve import Temperature
 from thermofusion.types import SharedErrors
@@ -197,6 +200,29 @@ def test_hostile_text_is_text(temperature, tmp_path):
             assert not any(k.startswith("on") or k == "style" for k in attributes), tag
             assert str(attributes.get("src", "data:")).startswith("data:")
     assert elements[0] == elements[1]
+
+
+def test_the_page_says_what_changed_and_what_is_not_skin(temperature, tmp_path):
+    """A region against the visit before, beyond chance or within; a dressing by its own ε, and why a foil is empty."""
+    told = {"vertices": 90, "measured": 88, "epsilon0": 0.85, "as_skin": False, "median_degC": 31.5,
+            "median_sigma_K": 0.21, "reason": ""}  # fmt: skip
+    foil = told | {"measured": 0, "epsilon0": None, "median_degC": None, "reason": "metal mirrors the room"}
+    covered = replace(temperature, materials={f"dressing of {HOSTILE}": told, "foil": foil})
+    changes = [Difference("knee", "knee, before", 0.84, 0.2), Difference("shin", "shin, before", 0.1, 0.2),
+               Difference("foot", "foot, before", 0.1, float("nan"))]  # fmt: skip
+    regions = [Spot(name=n, point_m=(0.15, 0.05, 0.02)) for n in ("knee", "shin", "foot")]
+    shown = Reported(covered, document(), Recipe(), regions=regions, changes=changes)
+    page = write_report(tmp_path / "report.html", shown).read_text()
+    assert re.search(r"knee.*?\+0\.84.*?0\.39.*?beyond.*?shin.*?within.*?foot.*?a level is relative", page)
+    assert re.search(
+        r"dressing of.*?0\.850.*?31\.50 °C ± 0\.21 K.*?88 of 90.*?foil.*?metal mirrors the room.*?0 of 90", page
+    )
+    assert "<script>window.pwned" not in page
+    filed = write_report(tmp_path / "filed.html", deidentified(shown)).read_text()
+    assert "knee" not in filed
+    assert "dressing" not in filed
+    assert re.search(r"spot 1.*?\+0\.84", filed)
+    assert re.search(r"material 1.*?31\.50 °C", filed)
 
 
 def test_the_same_result_gives_the_same_bytes(temperature, tmp_path):

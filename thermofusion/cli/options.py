@@ -85,13 +85,16 @@ class Filed:
         bool, typer.Option("--deidentify", help="Without colour, face, names, dates and free text.")
     ] = False
 
-    def reported(self, result: Path) -> Reported:
-        """The result of a folder as it may be filed. Raises ScanError, RecipeError."""
+    def reported(self, result: Path, before: Path | None = None) -> Reported:
+        """The result of a folder as it may be filed; before : of an earlier visit. Raises ScanError, RecipeError."""
+        from ..errors import RecipeError
         from ..regions import read_regions
         from ..report.deidentify import deidentified
         from ..results.folder import report_of
 
-        reported = report_of(result, [] if self.regions is None else read_regions(self.regions))
+        if before is not None and self.regions is None:
+            raise RecipeError("--before compares regions", hint="give --regions FILE, as the report saves it")
+        reported = report_of(result, [] if self.regions is None else read_regions(self.regions), before)
         return deidentified(reported) if self.deidentify else reported
 
 

@@ -11,6 +11,9 @@ from .console import emit, named, note, spared_file
 from .options import Filed, Json, spelled_out
 
 Folder = Annotated[Path, typer.Argument(help="A result folder.")]
+Before = Annotated[
+    Path | None, typer.Option("--before", help="Result of an earlier visit: how each region changed since.")
+]
 
 
 def register(app: typer.Typer) -> None:
@@ -23,6 +26,7 @@ def register(app: typer.Typer) -> None:
 def report(
     result: Folder,
     filed: Filed,
+    before: Before = None,
     out: Annotated[
         Path | None,
         typer.Option("-o", "--out", help="File; report.html in the result by default.", callback=spared_file),
@@ -34,7 +38,7 @@ def report(
     from ..report.html import write_report
     from ..report.summary import PAGE
 
-    path = write_report(out or result / (FILE if filed.deidentify else PAGE), filed.reported(result))
+    path = write_report(out or result / (FILE if filed.deidentify else PAGE), filed.reported(result, before))
     emit({"written": [path], "bytes": path.stat().st_size}, f"wrote {path}", json)
 
 
@@ -56,9 +60,7 @@ def measure(
     result: Folder,
     regions: Annotated[Path | None, typer.Option("--regions", help="Regions JSON, as the report saves it.")] = None,
     vertex: Annotated[list[int] | None, typer.Option("--vertex", help="Number of a vertex; may be repeated.")] = None,
-    before: Annotated[
-        Path | None, typer.Option("--before", help="Result of an earlier visit: how each region changed since.")
-    ] = None,
+    before: Before = None,
     labels: Annotated[
         bool, typer.Option("--labels", help="Also an .npz with each vertex's region, for materials of scan.json.")
     ] = False,
@@ -76,19 +78,17 @@ def measure(
     from ..files.json import to_json
     from ..files.whole import write_text, write_whole
     from ..regions import Measured, Measurer, read_regions
-    from ..results.folder import load_temperature
+    from ..results.folder import load_temperature, measured_of
     from ..version import __version__
 
     if regions is None and not vertex:
         raise RecipeError("nothing to measure", hint="give --regions FILE, or --vertex NUMBER")
     drawn = [] if regions is None else read_regions(regions)
-    temperature = load_temperature(result)
-    measurer = Measurer(temperature.mesh, temperature.shared, temperature.inputs)
+    now = load_temperature(result)
+    measurer = Measurer(now.mesh, now.shared, now.inputs)
     measured = Measured.of(measurer, drawn, vertex or ())
     if before is not None:
-        then = load_temperature(before)
-        earlier = Measured.of(Measurer(then.mesh, then.shared, then.inputs), drawn)
-        measured = measured.since(earlier, temperature.inputs)
+        measured = measured.since(measured_of(load_temperature(before), drawn), now.inputs)
     stem = out or result / "regions"
     files = {".csv": measured.csv(), "-budget.csv": measured.budget_csv(), ".json": to_json(measured.document()) + "\n"}
     for suffix, text in files.items():

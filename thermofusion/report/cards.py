@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from ..regions import Difference
+from ..robust import NORMAL_95
 from ..temperature.solve import Temperature
 from ..types import ThermalMesh
 from .lettering import ticks
@@ -61,10 +63,18 @@ def _quality(report: dict[str, Any]) -> list[str]:
     return out
 
 
-def below(report: dict[str, Any], temperature: Temperature, recipe: str, hashes: dict[str, str]) -> str:
-    """What stands under the body, card by card."""
+def below(
+    report: dict[str, Any],
+    temperature: Temperature,
+    recipe: str,
+    hashes: dict[str, str],
+    changes: Sequence[Difference] = (),
+) -> str:
+    """What stands under the body, card by card. changes : of regions, since the visit before."""
     cards = [
         _card("Diagnosis", _diagnosis(report), wide=True),
+        _card("Since the visit before", _changes(changes)),
+        _card("What is not bare skin", _materials(temperature)),
         _card("How views were calibrated against each other", _plots(temperature), wide=True),
         _card("Uncertainty", _budget(temperature)),
         _card("Face, read before its shape was taken out", _face(report)),
@@ -108,6 +118,37 @@ def _diagnosis(report: dict[str, Any]) -> str:
         facts = "".join(f"<p><bdi>{escape(str(found[k]))}</bdi></p>" for k in ("evidence", "advice") if found.get(k))
         items.append(f"<li><details><summary><bdi>{escape(sentence)}</bdi></summary>{facts}</details></li>")
     return f"<ul>{''.join(items)}</ul>" if items else ""
+
+
+def _changes(changes: Sequence[Difference]) -> str:
+    """How each region changed, against what the two scans' errors alone would show."""
+    rows = []
+    for c in changes:
+        chance = NORMAL_95 * c.sigma_K
+        if not np.isfinite(c.delta_K):
+            rows.append((c.first, "not measured", "", ""))
+        elif not np.isfinite(chance):
+            rows.append((c.first, f"{c.delta_K:+.2f}", "not known: a level is relative", ""))
+        else:
+            rows.append(
+                (c.first, f"{c.delta_K:+.2f}", f"{chance:.2f}", "beyond" if abs(c.delta_K) > chance else "within")
+            )
+    if not rows:
+        return ""
+    heads = ("region", "now - before, K", "95 % by chance, K", "")
+    return table(heads, rows) + "<p>Chance holds both scans' errors; the skin's own, of the same person, cancel.</p>"
+
+
+def _materials(temperature: Temperature) -> str:
+    """What was read of dressings, hair and the like, by their own emissivity; why, where nothing was."""
+    rows = []
+    for name, m in temperature.materials.items():
+        read = m.get("reason") or "not measured"
+        if _number(m.get("median_degC")):
+            read = f"{m['median_degC']:.2f} °C ± {m['median_sigma_K']:.2f} K"
+        epsilon = "" if not _number(m.get("epsilon0")) else f"{m['epsilon0']:.3f}"
+        rows.append((name, "as skin" if m.get("as_skin") else epsilon, read, f"{m['measured']} of {m['vertices']}"))
+    return table(("part", "ε(0)", "median, or why not", "vertices measured"), rows) if rows else ""
 
 
 def _budget(temperature: Temperature) -> str:

@@ -40,7 +40,8 @@ def deidentified(reported: Reported) -> Reported:
     temperature, face = without_face(reported.temperature, str(reported.report.get("recipe", "")))
     report = _without_identity(reported.report) | {"face": face, "deidentified": True}
     regions = [r.model_copy(update={"name": f"{r.kind} {k}"}) for k, r in enumerate(reported.regions, 1)]
-    return Reported(temperature, report, recipe, None, regions)
+    changes = [replace(c, first=r.name, second=r.name) for c, r in zip(reported.changes, regions, strict=False)]
+    return Reported(temperature, report, recipe, None, regions, changes=changes)
 
 
 def without_face(temperature: Temperature, recipe: str) -> tuple[Temperature, list[dict[str, Any]]]:
@@ -49,7 +50,8 @@ def without_face(temperature: Temperature, recipe: str) -> tuple[Temperature, li
     mesh, shared = temperature.mesh, temperature.shared
     bare = replace(mesh.surface, color_rgb=None)
     known = {k: v for k, v in mesh.metadata.items() if k in KEPT or k.startswith("level_sigma_K")}
-    changed = replace(temperature, mesh=replace(mesh, surface=bare, metadata=known), messages=())
+    materials = {f"material {k}": m | {"reason": ""} for k, m in enumerate(temperature.materials.values(), 1)}
+    changed = replace(temperature, mesh=replace(mesh, surface=bare, metadata=known), messages=(), materials=materials)
     if recipe not in WITHOUT_HEAD:
         face = face_numbers(mesh, shared)
         changed = _coarsened(changed)

@@ -26,7 +26,7 @@ from ..files.whole import write_text
 from ..mapping.observe import Mapped
 from ..physics.band import ZERO_DEGC_K, Band
 from ..recipe import Recipe
-from ..regions import Measurer, Region
+from ..regions import Difference, Measurer, Region
 from ..robust import evenly
 from ..temperature.solve import Temperature
 from ..types import Float32, UInt8, VertexFlag
@@ -46,7 +46,6 @@ FLAG_TEXT = {
     VertexFlag.HIGH_RESIDUAL: "views disagree",
     VertexFlag.MOVED: "moved",
     VertexFlag.NOT_SKIN: "not skin",
-    VertexFlag.NOT_SKIN: "not skin",
 }
 TITLES = {
     "absolute": "Skin temperature",
@@ -61,6 +60,7 @@ class Reported:
 
     report : result.json. recipe : resolved; its palette and range are shown. mapped : what the thermal views saw, if it
     is at hand: without it no camera and no thermal image can be shown. hashes : SHA-256 of the result's files by name.
+    changes : of the regions, since an earlier visit.
     """
 
     temperature: Temperature
@@ -69,6 +69,7 @@ class Reported:
     mapped: Mapped | None = None
     regions: Sequence[Region] = ()
     hashes: dict[str, str] = field(default_factory=dict)
+    changes: Sequence[Difference] = ()
 
 
 def write_report(path: Path, reported: Reported, picture: UInt8 | None = None) -> Path:
@@ -91,7 +92,9 @@ def report_html(reported: Reported, picture: UInt8 | None = None) -> str:
         "TITLE": escape(f"{facts['scan']}: thermofusion report"),
         "HEAD": cards.head(reported.report, temperature.mesh),
         "PICTURES": _picture(picture),
-        "BELOW": cards.below(reported.report, temperature, reported.recipe.to_toml(), reported.hashes),
+        "BELOW": cards.below(
+            reported.report, temperature, reported.recipe.to_toml(), reported.hashes, reported.changes
+        ),
         "FOOT": f"thermofusion {escape(__version__)} · research use, not a diagnosis · scan "
         f"<bdi>{escape(str(facts['scan']))}</bdi>, run {escape(str(reported.report.get('run', '')))}",
         "FACTS": _json(facts),

@@ -18,7 +18,7 @@ from ..files.whole import changing_over, write_text
 from ..mapping.observe import Mapped
 from ..motion.body import parted
 from ..recipe import Recipe, load_recipe
-from ..regions import Measured, Measurer, Region
+from ..regions import Difference, Measured, Measurer, Region
 from ..report.casts import DOUBTS
 from ..report.casts import VIEWS as FACES
 from ..report.html import Reported, report_html, write_report
@@ -167,14 +167,23 @@ def add_files(folder: Path, paths: Sequence[Path]) -> None:
     write_text(folder / REPORT, to_json(report))
 
 
-def report_of(folder: Path, regions: Sequence[Region] = ()) -> Reported:
-    """What a finished result's report is made of. Raises ScanError, RecipeError."""
+def report_of(folder: Path, regions: Sequence[Region] = (), before: Path | None = None) -> Reported:
+    """What a result's report is made of; before : result of an earlier visit. Raises ScanError, RecipeError."""
     temperature, stored = load_temperature(folder), folder / WORK / "mapping.npz"
     report = read_json(folder / REPORT)
     recipe = load_recipe(folder / "recipe.resolved.toml")
     mapped = load_artifact(stored) if stored.is_file() else None
     known = isinstance(mapped, Mapped) and mapped.observations.vertex.max(initial=-1) < len(temperature.mesh)
-    return Reported(temperature, report, recipe, mapped if known else None, regions, hashes_of(folder))
+    changes: tuple[Difference, ...] = ()
+    if before is not None:
+        then = measured_of(load_temperature(before), regions)
+        changes = measured_of(temperature, regions).since(then, temperature.inputs).changes
+    return Reported(temperature, report, recipe, mapped if known else None, regions, hashes_of(folder), changes)
+
+
+def measured_of(temperature: Temperature, regions: Sequence[Region]) -> Measured:
+    """What regions of a result read."""
+    return Measured.of(Measurer(temperature.mesh, temperature.shared, temperature.inputs), regions)
 
 
 def hashes_of(folder: Path) -> dict[str, str]:
