@@ -31,7 +31,7 @@ def canonical(vertices: Float32, triangles: NDArray) -> tuple[Float32, Int]:
 
 
 def in_order(triangles: Int) -> Int:
-    """Triangles that start at their lowest vertex, sorted."""
+    """(F, 3) vertex indices: triangles that start at their lowest vertex, sorted."""
     lead = triangles.argmin(1)[:, None]
     tri = np.take_along_axis(triangles, (lead + np.arange(3)) % 3, axis=1)
     return tri[np.lexsort((tri[:, 2], tri[:, 1], tri[:, 0]))]

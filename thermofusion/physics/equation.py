@@ -20,7 +20,7 @@ from ..types import Float
 
 
 def excess_reading(x: ArrayLike, E: ArrayLike, offset: ArrayLike) -> NDArray:
-    """E·x + b: what a view reports above the reflected radiance, W m-2 sr-1; arguments broadcast."""
+    """E·x + offset: what a view reports above the reflected radiance, W m-2 sr-1; scalars or arrays that broadcast."""
     return np.asarray(np.asarray(E) * np.asarray(x) + np.asarray(offset))
 
 
@@ -33,7 +33,8 @@ def apparent_radiance(
     L_air: ArrayLike = 0.0,
     offset: ArrayLike = 0.0,
 ) -> Float:
-    """What the camera reports: τ[ε L_s + (1-ε) L_r] + (1-τ) L_air + b, all W m-2 sr-1; arguments broadcast.
+    """What the camera reports: τ[ε L_surface + (1-ε) L_reflected] + (1-τ) L_air + offset, all W m-2 sr-1, τ the
+    transmission; scalars or arrays that broadcast.
 
     With the normal-equivalent radiance in place of L_surface, epsilon is E(θ).
     """
@@ -53,32 +54,36 @@ def with_gain(L: ArrayLike, gain: float, L_pivot: float) -> NDArray:
 def leaving_radiance(
     L_apparent: ArrayLike, *, transmission: ArrayLike = 1.0, L_air: ArrayLike = 0.0, offset: ArrayLike = 0.0
 ) -> Float:
-    """Radiance that left the surface towards the camera: offset and air path removed, W m-2 sr-1; broadcast."""
+    """Radiance that left the surface towards the camera: (L_apparent - offset - (1 - transmission) L_air)/transmission,
+    W m-2 sr-1; scalars or arrays that broadcast."""
     tau = np.asarray(transmission)
     return np.asarray((np.asarray(L_apparent) - np.asarray(offset) - (1 - tau) * np.asarray(L_air)) / tau)
 
 
 def without_gain(L_reported: ArrayLike, offset: ArrayLike, gain: float, L_pivot: float) -> NDArray:
-    """Inverse of `with_gain` and a camera's offset, W m-2 sr-1; arguments broadcast."""
+    """Inverse of `with_gain` after offset is taken off L_reported, W m-2 sr-1; scalars or arrays that broadcast."""
     return np.asarray((np.asarray(L_reported) - offset + (gain - 1) * L_pivot) / gain)
 
 
 def normal_equivalent(L_leaving: ArrayLike, relative_epsilon: ArrayLike, L_reflected: ArrayLike) -> Float:
     """What the camera would report looking straight on: L0 = L_r + (L - L_r)/E with E = ε(θ)/ε(0), W m-2 sr-1.
 
-    Independent of ε(0); the radiance form of the paper's S step (Eqs. 26-27). Arguments broadcast.
+    Independent of ε(0); the radiance form of the paper's S step (Eqs. 26-27). L_leaving L, relative_epsilon E and
+    L_reflected L_r are scalars or arrays that broadcast.
     """
     return absolute(L_leaving, relative_epsilon, L_reflected)
 
 
 def absolute(L_normal: ArrayLike, epsilon0: ArrayLike, L_reflected: ArrayLike) -> Float:
-    """Radiance of a blackbody at the surface's temperature: L_s = L_r + (L0 - L_r)/ε(0), W m-2 sr-1; broadcast."""
+    """Radiance of a blackbody at the surface's temperature: L_reflected + (L_normal - L_reflected)/epsilon0,
+    W m-2 sr-1; scalars or arrays that broadcast."""
     L_r = np.asarray(L_reflected)
     return surface_radiance(np.asarray(L_normal) - L_r, epsilon0, L_r)
 
 
 def surface_radiance(x: ArrayLike, epsilon: ArrayLike, L_reflected: ArrayLike) -> Float:
-    """L_r + x/ε of an excess x, W m-2 sr-1: a blackbody's at the surface's temperature, or (ε = 1) straight on."""
+    """L_reflected + x/epsilon of an excess x, W m-2 sr-1: a blackbody's at the surface's temperature, or (ε = 1)
+    straight on; scalars or arrays that broadcast."""
     return np.asarray(np.asarray(L_reflected) + np.asarray(x) / np.asarray(epsilon))
 
 
@@ -88,7 +93,8 @@ def surface_radiance(x: ArrayLike, epsilon: ArrayLike, L_reflected: ArrayLike) -
 def paper_chain(
     T_apparent_degC: ArrayLike, epsilon: ArrayLike, T_ambient_degC: ArrayLike, *, S: ArrayLike = 1.0
 ) -> tuple[Float, Float]:
-    """The paper's own linear correction as printed, in degrees Celsius: (T_c, S·T_c).
+    """The paper's own linear correction as printed, (T_c, S·T_c), °C, of T_apparent_degC in surroundings of
+    T_ambient_degC; scalars or arrays that broadcast.
 
     Eq. 25: T_c = (T - (1-ε) T_a)/ε. Eqs. 26-27 scale the Celsius value by S = T(0)/T_c(0), the ratio of measured to
     corrected temperature where the surface faces the camera. Linear in temperature and dependent on the unit

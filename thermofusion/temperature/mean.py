@@ -34,7 +34,8 @@ class Groups:
 
     @classmethod
     def by_vertex(cls, vertex: Int, n_vertices: int) -> tuple[Groups, NDArray]:
-        """Groups of equal vertices, and the order (N,) that brings rows into groups and keeps it within them."""
+        """Groups of rows with the same number in vertex (N,), and the order (N,) that brings rows into groups and keeps
+        it within them."""
         n = len(vertex)
         # a transposed sparse matrix is a counting sort
         sorted_ = csc_matrix((np.arange(n, dtype=np.int32), vertex, np.arange(n + 1)), shape=(n_vertices, n)).tocsr()
@@ -53,13 +54,13 @@ class Groups:
         return Groups(self.vertex[first:last], start - begin, count), slice(begin, begin + int(count.sum()))
 
     def sums(self, values: NDArray) -> Float:
-        """Sum of row values (N,) per group, (G,)."""
+        """Sum of row values (N,), of any unit, per group, (G,) in their unit; positions are those of `vertex`."""
         if not len(self):
             return np.zeros(0)
         return np.asarray(np.add.reduceat(values, self.start, dtype=np.float64))
 
     def weighted_sums(self, weights: NDArray, columns: NDArray) -> Float:
-        """Σ weight · row of columns (N, K) per group, (G, K)."""
+        """Σ weights (N,) times rows of columns (N, K) per group, (G, K)."""
         n = len(weights)
         edges = np.append(self.start, n)
         return np.asarray(csr_matrix((weights, np.arange(n), edges), shape=(len(self), n)) @ columns, np.float64)

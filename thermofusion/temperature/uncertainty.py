@@ -146,7 +146,7 @@ def silhouette_share(edge_px: NDArray, errors: ErrorModel) -> Float32:
 
 
 def skin_slope(band: Band, radiance: NDArray) -> float:
-    """dL/dT at the median of observed radiances: the factor between K and W m-2 sr-1 in weights and bounds."""
+    """dL/dT at the median of observed radiances (N,): the factor between K and W m-2 sr-1 in weights and bounds."""
     typical = float(np.nanmedian(radiance[:: max(1, len(radiance) // 10_000)])) if len(radiance) else float("nan")
     T = float(band.temperature_K(typical))
     return float(band.d_radiance_dT(T if np.isfinite(T) else 306.15))

@@ -44,7 +44,7 @@ class ImageField:
         return np.asarray(self.exponents[1:].sum(axis=1), np.int32)
 
     def patterns(self, u_px: NDArray, v_px: NDArray) -> Float:
-        """(N, K) the patterns at pixels."""
+        """(N, K) the patterns at pixels u_px, v_px (N,)."""
         return _monomials(u_px, v_px, self.width_px, self.height_px, self.exponents) @ self.mixing
 
     def __call__(self, u_px: NDArray, v_px: NDArray) -> NDArray:
