@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 # A stage is handed exactly the recipe sections that its key holds. It also depends on all stages before it.
 STAGES = (
-    Stage("tracking", ("input", "subject", "tracking"), edition=3),
+    Stage("tracking", ("input", "subject", "tracking"), edition=4),
     Stage("surface", ("input", "subject", "surface"), edition=8),
     Stage("rig", ("input", "rig"), edition=6),
     Stage("mapping", ("input", "mapping"), edition=12),

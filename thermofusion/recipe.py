@@ -75,7 +75,7 @@ class TrackingSection(_Section):
     source: Literal["auto", "recorded", "estimate"] = Field("auto", description="auto: recorded where there is one")
     refine: bool = Field(False, description="a recorded trajectory is only a start, refined like an estimated one")
     color: bool = Field(True, description="colour helps where a colour camera was recorded")
-    fragment_frames: int = Field(8, ge=2, le=1000, description="consecutive frames fused before loop closure")
+    fragment_frames: int = Field(8, ge=2, le=1000, description="consecutive frames fused before loop closure, at most")
     loop_closure: bool = Field(True, description="places seen again tie the camera's path together")
     refine_to_model: bool = Field(True, description="a last alignment of every frame with the fused model")
     min_fitness: float = Field(0.5, gt=0, le=1, description="share of a frame's points that must find a partner")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..geometry.rigid import invert, se3_exp
 from ..types import Float
 from .maps import DepthMap
-from .registration import MIN_PARTNERS, find_partners, normal_equations, shape_weights
+from .registration import MIN_PARTNERS, find_partners, image_shift, normal_equations, shape_weights, trust
 
 GOOD_SHARE = 0.4  # of a map's points: smaller overlaps, seen obliquely, serve where there are few better ones
 CONVERGED = 1e-4  # rad and m: far below a voxel
@@ -37,10 +37,12 @@ def solve_jointly(
     for _ in range(max_iterations):
         A, b, total, weight = np.zeros((6 * n, 6 * n)), np.zeros(6 * n), 0.0, 0.0
         for i, j in edges:
-            partners = find_partners(maps[i], maps[j], invert(T[j]) @ T[i], reach_m, stride)
+            T_j_i = invert(T[j]) @ T[i]
+            partners = find_partners(maps[i], maps[j], T_j_i, reach_m, stride)
             if len(partners) < MIN_PARTNERS // stride:
                 continue
-            h, g = normal_equations(partners, T[j])
+            share = trust(image_shift(partners.shape.points, T_j_i))
+            h, g = (share * of for of in normal_equations(partners, T[j]))
             si, sj = slice(6 * i, 6 * i + 6), slice(6 * j, 6 * j + 6)
             A[si, si] += h
             A[sj, sj] += h

@@ -14,7 +14,7 @@ from ..types import Float
 from .fragments import Fragment, build_fragment
 from .frames import TrackingFrame, TrackingFrames
 from .maps import DepthMap, Intrinsics
-from .registration import REACH_M, Partners, agreement, find_partners, register_view
+from .registration import REACH_M, Partners, agreement, find_partners, image_shift, register_view
 
 # Reach of partners, one iteration each: from what a fast walk moves in a frame down to what noise spreads.
 REACHES_M = (0.08, 0.05, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03)
@@ -24,6 +24,7 @@ STEP_TOLERANCE = 2e-5  # rad and m: well below what one frame's noise allows
 MIN_AGREEMENT = 0.75  # of what both frames could see, outlines included; neighbours have 0.86 to 1
 MAX_SPEED_M_S, MAX_SPEED_DEG_S = 2.5, 180.0  # faster is no walk: a failure
 MIN_STEP_M, MIN_STEP_DEG = 0.06, 6.0  # always possible, however near in time two frames stand
+FRAGMENT_SHIFT_TAN = 0.06  # in the image within a fragment: averaging frames whose camera errors differ bends it
 MAX_GAP_FRAMES = 5  # empty frames that a segment may step over
 
 
@@ -177,7 +178,10 @@ class GrowingSegment:
     def _append(self, frame: TrackingFrame, T: Float, partners: Partners | None, T_last_now: Float) -> None:
         self._frames.append(frame.index)
         self._T.append(T)
-        self._chain.append(self._chain[-1] @ T_last_now if self._chain else T)
+        chained = self._chain[-1] @ T_last_now if self._chain else T
+        if self._pending and self._shift(frame, chained) > FRAGMENT_SHIFT_TAN:
+            self._close_fragment()
+        self._chain.append(chained)
         self._fitness.append(np.nan if partners is None else partners.share)
         self._residual.append(np.nan if partners is None else partners.residual_mm_at_1m)
         self._samples.append(frame.map.sample_only())
@@ -186,6 +190,10 @@ class GrowingSegment:
         self._last = frame
         if len(self._pending) == self._tracking.fragment_frames:
             self._close_fragment()
+
+    def _shift(self, frame: TrackingFrame, chained: Float) -> float:
+        """How far the frame's points have moved in the image since the first frame of the fragment that grows."""
+        return image_shift(frame.map.sample.T, invert(chained) @ self._chain[-len(self._pending)])
 
     def _close_fragment(self) -> None:
         poses = np.array(self._chain[-len(self._pending) :])

@@ -23,6 +23,7 @@ COS_FACING = float(np.cos(np.radians(45.0)))  # partners must face alike
 MIN_PARTNERS = 150  # a twentieth of a frame's points: fewer fix no pose
 NOISE_FLOOR_M = 3e-4  # at 1 m: no spread of residuals is believed to be smaller
 RANGE_BIAS_1_M = 0.01  # a depth camera's own error, as z², here at 1 m: what two views share of it cancels
+UNSHIFTED_TAN = 0.07  # points that move less than this in the image (tangents) carry nearly one camera error in both
 REACH_M = 0.05  # of the partners that judge a motion
 INTENSITY_FLOOR = 0.05  # of the normalised intensity, whose local spread is about 1
 
@@ -172,6 +173,24 @@ def normal_equations(partners: Partners, T_world_target: Float) -> tuple[Float, 
 def _summed(rows: Rows, weight: Float, T_world_target: Float) -> tuple[Float, Float]:
     H, g = add_up(rows.points, rows.directions, rows.residual, weight, T_world_target)
     return H, g
+
+
+def image_shift(points: Float, T_target_source: Float) -> float:
+    """How far the image of points (3, N) of the target's frame moves between two views: rms, in tangents; 0 of none."""
+    if not points.size:
+        return 0.0
+    there = T_target_source[:3, :3].T @ (points - T_target_source[:3, 3:])
+    dx, dy = there[0] / there[2] - points[0] / points[2], there[1] / there[2] - points[1] / points[2]
+    return float(np.sqrt((dx @ dx + dy @ dy) / points.shape[1]))
+
+
+def trust(shift_tan: float) -> float:
+    """Share of a pair's information that counts, by how far its points move in the image.
+
+    A depth camera errs smoothly over its image (lens, pattern), and thousands of points together have less noise than
+    that. Two views whose points hardly move in the image share the error; what they differ by grows with the move.
+    """
+    return 1 / (1 + (shift_tan / UNSHIFTED_TAN) ** 2)
 
 
 def register_view(
