@@ -76,6 +76,7 @@ class TrackingSection(_Section):
     refine: bool = Field(False, description="a recorded trajectory is only a start, refined like an estimated one")
     color: bool = Field(True, description="colour helps where a colour camera was recorded")
     fragment_frames: int = Field(8, ge=2, le=1000, description="consecutive frames fused before loop closure, at most")
+    max_fragment_shift_deg: float = Field(45.0, gt=0, le=90, description="motion in the image that ends a fragment")
     loop_closure: bool = Field(True, description="places seen again tie the camera's path together")
     refine_to_model: bool = Field(True, description="a last alignment of every frame with the fused model")
     min_fitness: float = Field(0.5, gt=0, le=1, description="share of a frame's points that must find a partner")

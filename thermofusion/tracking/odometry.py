@@ -24,7 +24,6 @@ STEP_TOLERANCE = 2e-5  # rad and m: well below what one frame's noise allows
 MIN_AGREEMENT = 0.75  # of what both frames could see, outlines included; neighbours have 0.86 to 1
 MAX_SPEED_M_S, MAX_SPEED_DEG_S = 2.5, 180.0  # faster is no walk: a failure
 MIN_STEP_M, MIN_STEP_DEG = 0.06, 6.0  # always possible, however near in time two frames stand
-FRAGMENT_SHIFT_TAN = 0.06  # in the image within a fragment: averaging frames whose camera errors differ bends it
 MAX_GAP_FRAMES = 5  # empty frames that a segment may step over
 
 
@@ -179,7 +178,7 @@ class GrowingSegment:
         self._frames.append(frame.index)
         self._T.append(T)
         chained = self._chain[-1] @ T_last_now if self._chain else T
-        if self._pending and self._shift(frame, chained) > FRAGMENT_SHIFT_TAN:
+        if self._pending and self._shift_deg(frame, chained) > self._tracking.max_fragment_shift_deg:
             self._close_fragment()
         self._chain.append(chained)
         self._fitness.append(np.nan if partners is None else partners.share)
@@ -191,9 +190,10 @@ class GrowingSegment:
         if len(self._pending) == self._tracking.fragment_frames:
             self._close_fragment()
 
-    def _shift(self, frame: TrackingFrame, chained: Float) -> float:
+    def _shift_deg(self, frame: TrackingFrame, chained: Float) -> float:
         """How far the frame's points have moved in the image since the first frame of the fragment that grows."""
-        return image_shift(frame.map.sample.T, invert(chained) @ self._chain[-len(self._pending)])
+        T_now_first = invert(chained) @ self._chain[-len(self._pending)]
+        return float(np.degrees(np.arctan(image_shift(frame.map.sample.T, T_now_first))))
 
     def _close_fragment(self) -> None:
         poses = np.array(self._chain[-len(self._pending) :])
