@@ -276,7 +276,12 @@ def test_face_bars_on_the_real_pair(shared_data, tmp_path):
 
 
 def test_cylinder_in_3d_is_uniform_after_correction(tmp_path):
-    report = reproduce(None, tmp_path, ["cylinder"])
+    report = reproduce(None, tmp_path, ["cylinder", "methods"])
+    rows = next(f for f in report.figures if f.name == "methods-phantoms").tables[""]
+    for scan in ("cylinder", "head"):
+        rms_K = {m: e for s, m, e in zip(rows["scan"], rows["method"], rows["rms_K"], strict=True) if s == scan}
+        assert rms_K["joint"] == min(rms_K.values()) < 0.06
+    assert min(rows["vertices"]) > 5000
     assert not report.failed
     n = numbers(report)
     corrected = n["peak to peak of the medians, 0-60°: joint"].ours

@@ -28,7 +28,7 @@ def _figure(stem: str, cases: Sequence[Case]) -> Figure:
     numbers = []
     for case in cases:
         for method in METHODS:
-            e = case.truth.error(_by_method(case.scan, case.recipe, case.result, method), case.result.trajectory)
+            e = case.truth.error(by_method(case.scan, case.recipe, case.result, method), case.result.trajectory)
             for key, value in zip(rows, (case.name, method, e.vertices, e.level_K, e.rms_K, e.p95_K), strict=True):
                 rows[key].append(value)
             numbers.append(Number(f"{case.name}, {method}: rms error, level removed", e.rms_K, "K"))
@@ -36,16 +36,17 @@ def _figure(stem: str, cases: Sequence[Case]) -> Figure:
     return Figure(stem, "Every method against the truth", tables={"": rows}, numbers=numbers, notes=[note])
 
 
-def _by_method(scan: Scan, recipe: Recipe, result: Result, method: str) -> ThermalMesh:
-    """The same surface and observations, blended by another method."""
+def by_method(scan: Scan, recipe: Recipe, result: Result, method: str) -> ThermalMesh:
+    """The same surface and observations, blended by another method; in the result's frame, as its trajectory is."""
     assert result.surface is not None
+    assert result.frame is not None
     assert result.mapped is not None
     if method == recipe.temperature.method:
-        return result.mesh_in_world
+        return result.mesh
     other = recipe.temperature.model_copy(update={"method": method})
     surface = result.surface
     window_m = surface.normal_window_m
     found = solve(
         scan, surface.mesh, result.mapped, normal_window_m=window_m, mapping=recipe.mapping, temperature=other
     )
-    return found.mesh
+    return result.frame.mesh(found.mesh)
