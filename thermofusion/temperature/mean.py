@@ -11,6 +11,7 @@ from scipy.sparse import csc_matrix, csr_matrix
 
 from ..robust import MAD_PER_SIGMA, TUKEY, huber_weight, tukey_weight
 from ..types import Float, Float32, Int
+from .loops.mean import Steps, robust_weights
 
 L1_STEPS, TUKEY_STEPS = 4, 3
 SCALE_ROWS = 200_000  # enough for a robust scale
@@ -107,17 +108,28 @@ class RobustMean:
         if not robust or not len(x):
             return Solved(x, weight)
         root = np.sqrt(self.weight if self.statistical else self.weight / np.float32(np.median(self.weight)))
-        sample = self._scale_rows() if scale is None else None
+        if scale is not None:
+            weight = self._balanced(self._reweighted(root, scale))
+            return Solved(self._estimate(weight), weight)
+        sample = self._scale_rows()
         for _ in range(L1_STEPS):
-            weight = self._weights(x, root, L1_FLOOR * (scale or self._scale(x, root, sample)), huber_weight)
+            weight = self._weights(x, root, L1_FLOOR * self._scale(x, root, sample), huber_weight)
             x = self._estimate(weight)
         l1 = weight
         for _ in range(TUKEY_STEPS):
-            weight = self._weights(x, root, TUKEY * (scale or self._scale(x, root, sample)), tukey_weight)
+            weight = self._weights(x, root, TUKEY * self._scale(x, root, sample), tukey_weight)
             weight = self._measured_kept(weight, l1)
             x = self._estimate(weight)
         weight = self._balanced(weight)
         return Solved(self._estimate(weight), weight)
+
+    def _reweighted(self, root: Float32, scale: float) -> Float32:
+        """The weights of `solve` at a known scale: then no group depends on another."""
+        out = np.empty_like(self.weight)
+        steps = Steps(L1_STEPS, L1_FLOOR * scale, TUKEY_STEPS, TUKEY * scale, LEAST_WEIGHT)
+        groups = self.groups
+        robust_weights(groups.start, groups.count, self.y, self.E, self.weight, root, steps, out)
+        return out
 
     def residual(self, x: Float) -> Float32:
         """y - E·x of all rows (N,), W m-2 sr-1, of the groups' x (G,)."""
@@ -203,9 +215,9 @@ class RobustMean:
         n = self.groups.rows(self.groups.count)[pick]
         return pick, np.sqrt(n / (n - 1))
 
-    def _scale(self, x: Float, root: Float32, sample: tuple[NDArray, Float] | None) -> float:
+    def _scale(self, x: Float, root: Float32, sample: tuple[NDArray, Float]) -> float:
         """Robust scale of standardised residuals."""
-        if sample is None or not len(sample[0]):
+        if not len(sample[0]):
             return 1.0
         pick, freedom = sample
         return max(float(np.median(np.abs(self.residual(x)[pick]) * root[pick] * freedom)) / MAD_PER_SIGMA, 1e-3)

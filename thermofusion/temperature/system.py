@@ -18,6 +18,7 @@ from ..physics.equation import excess_reading
 from ..robust import HUBER, MAD_PER_SIGMA, TUKEY, huber_weight, median, tukey_weight
 from ..types import Bool, Float, Int
 from .layout import Layout
+from .loops.overlap import Rows, overlap_sums
 from .mean import Groups
 from .references import ExpectedReading
 from .sensor.earlier import FieldPrior
@@ -282,41 +283,13 @@ class OverlapSystem:
         G : (N, K + 2) derivatives by field, shape and gain; the shape's column is filled here.
         """
         at = self.layout
-        M, P = at.n_offsets, at.size
-        s = p[at.shape]
-        E = self.E + s * self.D
-        bend = at.n_patterns
-        G[:, bend] = self.D * x[self.vertex] if self.use_shape else 0.0
-        y = self.y + s * G[:, bend]  # s enters as s_old + δ: give back what the linearisation at s_old took
-
-        wE = w * E
-        by_vertex = csr_matrix((wE[self.order], self.order, self.start), shape=(self.n_vertices, len(w)))
-        a = by_vertex @ E
-        a[a <= 0] = np.inf
-        c = by_vertex @ y
-        B = np.empty((len(a), P))
-        to_group = (by_vertex.data, self.group[self.order], self.start)
-        B[:, at.offsets] = csr_matrix(to_group, shape=(len(a), M)).toarray()
-        B[:, at.shared] = by_vertex @ G
-
-        by_group = csr_matrix((w, self.group, np.arange(len(w) + 1)), shape=(len(w), M)).T
-        N, rhs = np.zeros((P, P)), np.empty(P)
-        N[np.arange(M), np.arange(M)] = np.bincount(self.group, w, M)
-        N[at.offsets, at.shared] = by_group @ G
-        N[at.shared, at.offsets] = N[at.offsets, at.shared].T
+        rows = Rows(self.group, self.y, self.E, self.D, G, self.order, self.start)
+        bend = at.n_patterns if self.use_shape else -1
+        a, c, B, N, rhs = overlap_sums(rows, w, x, float(p[at.shape]), bend, at.n_offsets)
         N[at.shared, at.shared] = _square(G, w)
-        wy = w * y
-        rhs[at.offsets], rhs[at.shared] = np.bincount(self.group, wy, M), wy @ G
-
+        a[a <= 0] = np.inf
         if self.sensor_columns is not None:
-            X = self.sensor_columns
-            wX = X.multiply(w[:, None]).tocsr()
-            B[:, at.sensor] = (by_vertex @ X).toarray()
-            N[at.offsets, at.sensor] = (by_group @ X).toarray()
-            N[at.shared, at.sensor] = (wX.T @ G).T
-            N[at.sensor, : at.sensor.start] = N[: at.sensor.start, at.sensor].T
-            N[at.sensor, at.sensor] = (X.T @ wX).toarray()
-            rhs[at.sensor] = wX.T @ y
+            B, N, rhs = self._with_columns(p[at.shape], x, w, G, (B, N, rhs))
 
         level = self._level(a, c, B)
         N -= _square(B, 1 / a)
@@ -327,6 +300,26 @@ class OverlapSystem:
         p, covariance, level_gain = constrained_minimum(N, rhs, level.row, level.target, spread=spread)
         p[at.shape] = np.clip(p[at.shape], *SHAPE_BOUNDS)
         return p, (c - B @ p) / a, covariance, N, level_gain, level.variance
+
+    def _with_columns(
+        self, s: float, x: Float, w: Float, G: Float, sums: tuple[Float, Float, Float]
+    ) -> tuple[Float, Float, Float]:
+        """B, N and the right side with the sensor's columns; s : the shape."""
+        assert self.sensor_columns is not None
+        at, X, before = self.layout, self.sensor_columns, slice(0, self.layout.sensor.start)
+        B, N, rhs = np.empty((self.n_vertices, at.size)), np.zeros((at.size, at.size)), np.empty(at.size)
+        B[:, before], N[before, before], rhs[before] = sums
+        y = self.y + s * G[:, at.n_patterns] if self.use_shape else self.y
+        wE, wX = w * (self.E + s * self.D), X.multiply(w[:, None]).tocsr()
+        by_vertex = csr_matrix((wE[self.order], self.order, self.start), shape=(self.n_vertices, len(w)))
+        by_group = csr_matrix((w, self.group, np.arange(len(w) + 1)), shape=(len(w), at.n_offsets)).T
+        B[:, at.sensor] = (by_vertex @ X).toarray()
+        N[at.offsets, at.sensor] = (by_group @ X).toarray()
+        N[at.shared, at.sensor] = (wX.T @ G).T
+        N[at.sensor, before] = N[before, at.sensor].T
+        N[at.sensor, at.sensor] = (X.T @ wX).toarray()
+        rhs[at.sensor] = wX.T @ y
+        return B, N, rhs
 
     def _add_priors(self, N: Float, rhs: Float) -> None:
         """Weak knowledge that only matters where the overlap has none, never about the common level."""
