@@ -41,7 +41,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "files": ("types", "errors", "version"),
     "recipe": ("errors", "files"),
     "geometry": ("types", "errors", "compiled", "robust"),
-    "physics": ("types", "errors", "recipe"),
+    "physics": ("types", "errors", "compiled", "recipe"),
     "scans": (*BASE, "physics"),
     "depth": BASE,
     "tracking": (*BASE, "depth", "scans"),

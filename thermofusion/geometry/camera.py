@@ -1,13 +1,16 @@
-"""The pinhole camera: distortion, projection, pixel rays, viewing angles. Pure NumPy.
+"""The pinhole camera: distortion, projection, pixel rays, viewing angles.
 
 x right, y down, z forward; the centre of the first pixel is (0, 0) (paper Eqs. 2-8, with OpenCV's coefficient order).
 """
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
+from ..compiled import compiled
 from ..types import Camera, Float
 
 
@@ -49,8 +52,13 @@ def max_image_radius(distortion: Float) -> float:
     distortion : (5,) or (8,). Beyond r a barrel-distorted model folds back: points far outside the field of view would
     land *inside* the image.
     """
-    if not np.any(distortion):
-        return np.inf
+    return _max_radius(np.asarray(distortion, np.float64).tobytes()) if np.any(distortion) else np.inf
+
+
+@lru_cache(maxsize=64)
+def _max_radius(distortion_bytes: bytes) -> float:
+    """Of the coefficients' bytes: a camera is asked for each of its images."""
+    distortion = np.frombuffer(distortion_bytes, np.float64)
     r = np.linspace(0, 4, 8001)
     radial = distort(r, np.zeros_like(r), np.concatenate([distortion[:2], [0, 0], distortion[4:]]))[0]
     falling = np.flatnonzero(~(np.diff(radial) > 0))
@@ -92,5 +100,14 @@ def viewing_cosine(points: NDArray, normals: NDArray, eye: NDArray) -> NDArray:
     points : (N, 3) m. normals : (N, 3) unit. eye : (3,) m.
     The pixel's own ray, not the camera axis of the paper's Eq. 28; negative for back faces.
     """
-    d = eye.astype(points.dtype) - points
-    return np.einsum("ij,ij->i", d, normals) / np.sqrt(np.einsum("ij,ij->i", d, d))
+    return np.asarray(_cosines(points, normals, eye.astype(points.dtype)))
+
+
+@compiled
+def _cosines(points: NDArray, normals: NDArray, eye: NDArray) -> NDArray:  # pragma: no cover
+    """`viewing_cosine` in the points' type."""
+    out = np.empty(points.shape[0], points.dtype)
+    for k in range(points.shape[0]):
+        x, y, z = eye[0] - points[k, 0], eye[1] - points[k, 1], eye[2] - points[k, 2]
+        out[k] = (x * normals[k, 0] + y * normals[k, 1] + z * normals[k, 2]) / np.sqrt(x * x + y * y + z * z)
+    return out

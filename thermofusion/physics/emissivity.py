@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 from scipy.interpolate import PchipInterpolator
 
+from ..compiled import compiled
 from ..errors import RecipeError
 from ..recipe import EmissivitySection
 from ..types import Float
@@ -281,6 +282,17 @@ class AngleTable:
 
     def __call__(self, cos_theta: NDArray) -> NDArray:
         """Values at cosines in [0, 1]; outside the nearest end."""
-        x = np.clip(cos_theta, 0, 1).astype(np.float32) * np.float32(LOOKUP_KNOTS - 1)
-        i = x.astype(np.int32)
-        return np.asarray(self.values.take(i) + self.steps.take(i) * (x - i.astype(np.float32)))
+        cos = np.asarray(cos_theta)
+        return np.reshape(_looked_up(self.values, self.steps, np.ravel(cos)), cos.shape)
+
+
+@compiled
+def _looked_up(values: NDArray, steps: NDArray, cos: NDArray) -> NDArray:  # pragma: no cover
+    """(N,) of a table's values and steps (K,) at cosines (N,), in the table's type."""
+    out = np.empty(cos.size, values.dtype)
+    last, zero, one = np.float32(values.size - 1), np.float32(0), np.float32(1)
+    for k in range(cos.size):
+        x = min(max(np.float32(cos[k]), zero), one) * last
+        i = np.uint32(x)
+        out[k] = values[i] + steps[i] * (x - np.float32(i))
+    return out

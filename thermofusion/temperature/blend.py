@@ -213,11 +213,11 @@ def _blend(rows: Observations, groups: Groups, problem: ThermalProblem, task: _T
         L0, L_s = surface_radiance(x, 1.0, L_r), surface_radiance(x, task.epsilon0, L_r)
         columns["residual"], spread = mean.scatter(solved)
         columns["spread_K"] = spread / task.slope_L
-        size = int(np.clip(problem.n_views // FEWEST_BLOCKS, 1, BLOCK_VIEWS))
-        to_K2 = (task.slope_L * task.epsilon0) ** -2
-        columns["own_K2"] = mean.own_variance(solved, rows.view // size) * to_K2
-        apart_K2 = mean.own_variance(solved, np.arange(len(rows), dtype=np.int32)) * to_K2
         if task.with_uncertainty:
+            size = int(np.clip(problem.n_views // FEWEST_BLOCKS, 1, BLOCK_VIEWS))
+            to_K2 = (task.slope_L * task.epsilon0) ** -2
+            columns["own_K2"] = mean.own_variance(solved, rows.view // size) * to_K2
+            apart_K2 = mean.own_variance(solved, np.arange(len(rows), dtype=np.int32)) * to_K2
             levers = _levers(rows, mean, solved, task, errors, problem.room_errors(groups.vertex))
             parts, common, modes = _errors_of(levers, x, band.temperature_K(L_s), columns, task, errors)
             if method == "joint":

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...types import Float, Int
+from ..loops.field import patterns_at
 
 FIELD_ORDER = 4  # polynomial order
 GRID = 64  # points along each side over which patterns are orthonormal
@@ -45,7 +46,10 @@ class ImageField:
 
     def patterns(self, u_px: NDArray, v_px: NDArray) -> Float:
         """(N, K) the patterns at pixels u_px, v_px (N,)."""
-        return _monomials(u_px, v_px, self.width_px, self.height_px, self.exponents) @ self.mixing
+        u, v = np.asarray(u_px, np.float64), np.asarray(v_px, np.float64)
+        x, y = _normalised(u, v, self.width_px, self.height_px)
+        highest = int(self.exponents.max(initial=0))
+        return np.asarray(patterns_at(x, y, self.exponents, np.ascontiguousarray(self.mixing), highest))
 
     def __call__(self, u_px: NDArray, v_px: NDArray) -> NDArray:
         """φ at pixels (N,), W m-2 sr-1, in the pixels' float type."""
