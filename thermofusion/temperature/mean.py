@@ -125,11 +125,9 @@ class RobustMean:
 
     def _reweighted(self, root: Float32, scale: float) -> Float32:
         """The weights of `solve` at a known scale: then no group depends on another."""
-        out = np.empty_like(self.weight)
         steps = Steps(L1_STEPS, L1_FLOOR * scale, TUKEY_STEPS, TUKEY * scale, LEAST_WEIGHT)
         groups = self.groups
-        robust_weights(groups.start, groups.count, self.y, self.E, self.weight, root, steps, out)
-        return out
+        return np.asarray(robust_weights(groups.start, groups.count, self.y, self.E, self.weight, root, steps))
 
     def residual(self, x: Float) -> Float32:
         """y - E·x of all rows (N,), W m-2 sr-1, of the groups' x (G,)."""

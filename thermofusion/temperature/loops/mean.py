@@ -24,12 +24,13 @@ class Steps(NamedTuple):
 
 @compiled
 def robust_weights(
-    start: NDArray, count: NDArray, y: Float, E: Float, weight: Float32, root: Float32, steps: Steps, out: Float32
-) -> None:  # pragma: no cover
-    """Weights (N,) of rows y = E·x in groups start (G,), count (G,), written to `out`; see `mean.RobustMean.solve`.
+    start: NDArray, count: NDArray, y: Float, E: Float, weight: Float32, root: Float32, steps: Steps
+) -> Float32:  # pragma: no cover
+    """Weights (N,) of rows y = E·x in groups start (G,), count (G,); see `mean.RobustMean.solve`.
 
     root : (N,) of a residual's factor to sigmas.
     """
+    out = np.empty_like(weight)
     one, floor, reach = np.float32(1), np.float32(steps.floor), np.float32(steps.reach)
     most = np.int64(0)
     for g in range(count.shape[0]):
@@ -62,3 +63,4 @@ def robust_weights(
             if left < steps.least * whole:
                 for k in range(first, last):
                     out[k] = l1[k - first]
+    return out
