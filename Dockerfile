@@ -5,5 +5,8 @@ RUN apt-get update && apt-get install -y --no-install-recommends libegl1 libgl1 
     && rm -rf /var/lib/apt/lists/*
 COPY . /src
 RUN pip install --no-cache-dir /src && rm -rf /src
+# Whoever runs it finds the inner loops compiled, and may compile them anew for another processor
+ENV NUMBA_CACHE_DIR=/var/cache/thermofusion
+RUN thermofusion demo -o /tmp/demo && rm -rf /tmp/demo && chmod -R a+rwX $NUMBA_CACHE_DIR
 WORKDIR /work
 ENTRYPOINT ["thermofusion"]
