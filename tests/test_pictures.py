@@ -312,7 +312,7 @@ def test_geometry_alone_has_no_temperatures_and_no_bar(monkeypatch):
 def test_pictures_are_deterministic_and_written(tmp_path):
     mesh = result()
     paths = write_views(mesh, tmp_path / "views", height_px=300)
-    assert {p.stem for p in paths} == {*VIEWS, "overview", "uncertainty"}
+    assert {p.stem for p in paths} == {*VIEWS, "overview", "uncertainty", "residual"}
     pictures = render_views(mesh, height_px=300)
     for path in paths[:5]:
         np.testing.assert_array_equal(cv2.imread(str(path))[..., ::-1], pictures[path.stem])

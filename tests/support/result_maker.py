@@ -48,6 +48,7 @@ def result(surface: SurfaceMesh | None = None, *, unmeasured_below_m: float = -0
         distance_m=per(1.2 + x),
         observations=np.where(measured, 3 + (x > 0), 0).astype(np.int32),
         flags=np.where(x > 0.05, VertexFlag.OBLIQUE | VertexFlag.CAVITY, 0).astype(np.uint8),
+        residual=per(1 + x),
         uncertainty_parts={"noise": per(0.05 + 0 * x), "emissivity": per(0.1 + 0 * x)},
         metadata={"up": "0 0 1", "front": "0 -1 0", "recipe": 'täst "x"\n2', "voxel_mm": 3.25, "long": "ab " * 700},
     )

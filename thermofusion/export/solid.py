@@ -95,6 +95,8 @@ def closed(mesh: ThermalMesh) -> ThermalMesh:
         observations=more(mesh.observations, 0),
         flags=more(mesh.flags, 0),
         uncertainty_parts={},
+        residual=None if mesh.residual is None else more(mesh.residual, np.nan),
+        moved_mm=None if mesh.moved_mm is None else more(mesh.moved_mm, np.nan),
     )
 
 
