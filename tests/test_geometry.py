@@ -157,6 +157,28 @@ def test_gradient_of_a_plane_and_of_noise():
     assert np.isfinite(edge_gradient(vertices, triangles, holed)).all()
 
 
+def test_fine_structure_is_half_the_laplacian_of_what_a_blur_leaves():
+    """On a wave of wave number k a blur of variance s² leaves exp(-k²s²/2), and a second one takes 1 - that of it."""
+    from thermofusion.geometry.mesh import fine_structure
+
+    edge = 3e-3
+    n = 80
+    grid = np.arange(n * n).reshape(n, n)
+    x, y = edge * (grid // n).ravel(), edge * (grid % n).ravel()
+    vertices = np.stack([x, y, 0 * x], axis=1).astype(np.float32)
+    a, b, c, d = (grid[i : n - 1 + i, j : n - 1 + j].ravel() for i, j in ((0, 0), (1, 0), (0, 1), (1, 1)))
+    triangles = np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)]).astype(np.int32)
+    inner = (np.minimum(x, y) > 0.06) & (np.maximum(x, y) < edge * (n - 1) - 0.06)
+    width, k = 5e-3, 2 * np.pi / 0.03
+    found = fine_structure(vertices, triangles, np.cos(k * x), width) * width**2
+    left = np.exp(-((k * width) ** 2) / 2)
+    np.testing.assert_allclose(found[inner].max(), left * (1 - left), rtol=0.15)
+    assert fine_structure(vertices, triangles, 30 + 20 * x, width)[inner].max() * width**2 < 1e-3
+    holed = np.where(x < 0.1, np.nan, 33.0)
+    assert not fine_structure(vertices, triangles, holed, width)[x < 0.1].any()
+    assert np.isfinite(fine_structure(vertices, triangles, holed, width)).all()
+
+
 def test_points_along_the_curve_cover_a_surface_evenly_in_whatever_order_they_stand():
     from thermofusion.geometry.patches import along_curve
 

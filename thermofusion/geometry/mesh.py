@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from ..types import Bool, Float, Float32, Int
 
 TAUBIN_SHRINK, TAUBIN_INFLATE = 0.5, -0.53  # low pass without shrinkage (Taubin 1995)
+MOST_BLURS = 24  # steps of a blur over neighbours: a finer mesh than that resolves what no camera does
 
 
 def canonical(vertices: Float32, triangles: NDArray) -> tuple[Float32, Int]:
@@ -183,6 +184,31 @@ def _average(triangles: Int, count: int, self_weight: float) -> csr_matrix:
     A = A + diags(np.full(count, np.float32(self_weight)), format="csr", dtype=np.float32)
     total = np.asarray(A.sum(1), np.float32).ravel()
     return (diags(1 / np.maximum(total, np.float32(1e-12)), dtype=np.float32) @ A).tocsr()
+
+
+def fine_structure(vertices: Float32, triangles: Int, values: NDArray, width_m: float) -> Float32:
+    """What a blur takes of values (V,) on a surface of vertices (V, 3) m, for each m² of its variance; 0: unmeasured.
+
+    width_m : about one sigma of the blur. Neighbours' means, as often as makes that width, are taken once against noise
+    (fine structure is known no better than that) and once more: the difference is half
+    the Laplacian.
+    """
+    mean, at = _average(triangles, len(vertices), self_weight=1.0), vertices.astype(np.float64)
+    variance = (mean @ at**2 - (mean @ at) ** 2).sum(1) / 2  # of one step, along either direction of the surface
+    steps = int(np.clip(round(width_m**2 / max(float(np.median(variance)), 1e-12)), 1, MOST_BLURS))
+
+    def blurred(x: NDArray) -> NDArray:
+        for _ in range(steps):
+            x = mean @ x
+        return x
+
+    known = np.isfinite(values)
+    columns = np.stack([np.where(known, values, 0), known], axis=1).astype(np.float32)
+    once = blurred(columns)
+    twice = blurred(once)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        taken = np.abs(once[:, 0] / once[:, 1] - twice[:, 0] / twice[:, 1]) / (steps * (mean @ variance))
+    return np.where(known, taken, 0).astype(np.float32)
 
 
 def edge_gradient(vertices: Float32, triangles: Int, values: NDArray) -> Float32:

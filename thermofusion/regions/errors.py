@@ -18,7 +18,7 @@ from .body import Body
 from .patch import Patch
 
 PIXEL_PATCH = 2.25  # pixels whose noise is one: bilinear sampling leaves 4/9 of the variance, over so much more area
-AVERAGED = ("noise", "normals")  # parts that a mean over an area reduces
+AVERAGED = ("noise", "resolution", "normals")  # parts that a mean over an area reduces; a blur only moves things about
 ALONG_GRADIENT = ("registration", "scale")  # parts that a picture displaced on the skin, or skin displaced, makes
 DERIVED = ("absolute",)  # made of the others
 MIN_COS = 0.2  # a pixel is not taken to cover more skin than at 78°
@@ -89,7 +89,7 @@ class VertexErrors:
         """From a mesh's budget. Without shared errors (an older result) nothing is taken to average."""
         parts = {k: np.nan_to_num(v) for k, v in mesh.uncertainty_parts.items()}
         zero = np.zeros(len(mesh), np.float32)
-        noise, normals = parts.get("noise", zero), parts.get("normals", zero)
+        noise, normals = np.hypot(parts.get("noise", zero), parts.get("resolution", zero)), parts.get("normals", zero)
         carried = {cause_of(name) for name in shared.names} if shared else set()  # signed, in the shared errors
         apart = {*AVERAGED, *ALONG_GRADIENT, *DERIVED, *carried}
         rest = np.sqrt(sum((v.astype(np.float64) ** 2 for k, v in parts.items() if k not in apart), zero))

@@ -94,7 +94,6 @@ def blend(problem: ThermalProblem, calibration: Calibration | None, *, with_unce
     observations, n_vertices = problem.observations, len(problem)
     task = _Task.of(problem, calibration, with_uncertainty)
     usable, oblique = _usable(problem)
-    gradient = np.broadcast_to(np.asarray(problem.errors.gradient_K_per_m, np.float32), (n_vertices,))
 
     counting = np.flatnonzero(usable)
     groups, order = Groups.by_vertex(observations.vertex[counting], n_vertices)
@@ -103,7 +102,7 @@ def blend(problem: ThermalProblem, calibration: Calibration | None, *, with_unce
     def block(edges: tuple[int, int]) -> _Block:
         mine, numbers = groups.part(*edges)
         rows = observations.select(counting[numbers])
-        local = replace(problem.errors, gradient_K_per_m=gradient[mine.vertex])
+        local = problem.errors.at(mine.vertex, n_vertices)
         rows = replace(rows, vertex=mine.rows(np.arange(len(mine), dtype=np.int32)))
         return _blend(rows, mine, problem, task, local)
 

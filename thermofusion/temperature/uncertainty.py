@@ -19,6 +19,7 @@ from ..robust import median
 from ..types import Float, Float32, Observations, ThermalCamera, cause_of
 
 DEFAULT_SIGMA_NORMAL_DEG = 2.0  # of normals over a 25 mm window of a Kinect's surface
+PIXEL_VARIANCE_PX2, SAMPLING_VARIANCE_PX2 = 1 / 12, 1 / 6  # of a square pixel; of bilinear weights, on average
 DEFAULT_PSF_PX = 0.7  # point spread of a microbolometer camera in focus, where it was not measured
 EDGE_MARGIN_PX = 0.5  # fused surfaces shrink or swell by about this much of a thermal pixel
 BILINEAR_VARIANCE = 4 / 9  # mean over sub-pixel positions of the noise variance left by bilinear sampling
@@ -35,7 +36,8 @@ class ErrorModel:
 
     netd_K : noise of a pixel. sigma_normal_deg : of the surface normal, per axis. sigma_shape : relative, of 1-E(θ),
     where it is not fitted. sigma_registration_px : of the thermal image on the surface. sigma_reflected_K : of the
-    room's reflected temperature. gradient_K_per_m : temperature gradient along the surface, scalar or (V,).
+    room's reflected temperature. gradient_K_per_m : temperature gradient along the surface, scalar or (V,). blurred_K :
+    what the thermal image's own blur takes of the temperature, scalar or (V,).
     sigma_emissivity0 : of ε(0). sigma_gain : of the camera's gain. sigma_depth_scale : of the depth camera's scale.
     aligned_px : what the alignment left between the outlines, NaN = not measured; depth_scale : error of the depth's
     scale that it asks for. psf_sigma_px : point spread of the
@@ -56,6 +58,21 @@ class ErrorModel:
     psf_sigma_px: float = DEFAULT_PSF_PX
     edge_margin_px: float = EDGE_MARGIN_PX
     gradient_K_per_m: float | Float32 = 0.0
+    blurred_K: float | Float32 = 0.0
+
+    def informed(self, gradient_K_per_m: Float32, blurred_K: Float32) -> ErrorModel:
+        """With what a map tells of its own vertices, (V,)."""
+        return replace(self, gradient_K_per_m=gradient_K_per_m, blurred_K=blurred_K)
+
+    def at(self, vertices: NDArray, of: int) -> ErrorModel:
+        """Of some vertices (N,) among `of`."""
+        own = (np.broadcast_to(np.asarray(x, np.float32), (of,)) for x in (self.gradient_K_per_m, self.blurred_K))
+        return self.informed(*(x[vertices] for x in own))
+
+    @property
+    def blur_px(self) -> float:
+        """One sigma of what blurs the thermal image on the surface: point spread, pixel, bilinear sampling."""
+        return float(np.sqrt(self.psf_sigma_px**2 + PIXEL_VARIANCE_PX2 + SAMPLING_VARIANCE_PX2))
 
     @property
     def registration_over(self) -> float:
@@ -167,7 +184,8 @@ class Uncertainty:
         noise : of the pixels. calibration : offsets and field of the views. shape : of ε(θ), where it is not fitted.
         normals : of the surface. registration : thermal image on a temperature gradient. silhouette : room mixed in at
         the body's outline. air : differences in the air path. emissivity0, reflected : what errors of ε(0) and T_refl
-        do beyond their common shift. gain : likewise. scale : of the depth, on a gradient. pattern : what
+        do beyond their common shift. gain : likewise. scale : of the depth, on a gradient. resolution : what the
+        image's own blur takes of spots and veins as small as itself. pattern : what
         residuals still have in common by place in the image. views : how far views disagree beyond what the other
         parts explain; for methods that do not calibrate them, all of it.
         path : of air between subject and camera, more or less than the reference's. operator : who holds the camera.
@@ -301,6 +319,7 @@ def vertex_uncertainty(
         "normals": scale * np.abs(x) * tilt * normal,
         "registration": np.asarray(errors.gradient_K_per_m) * levers.registration_m * b.registration_over,
         "scale": np.asarray(errors.gradient_K_per_m) * shift_m * ALONG_SURFACE,
+        "resolution": zero + np.asarray(errors.blurred_K),
         "pattern": zero + b.pattern_K,
         "silhouette": scale * np.abs(x) * levers.silhouette,
         "air": zero if b.air_K is None else np.abs(T_K - b.air_K) * air_loss * np.abs(path_m),
