@@ -372,6 +372,23 @@ def test_it_begins_and_ends_as_told(tmp_path):
     assert 20 <= state.streams["steady/depth"].frames < 400
 
 
+def test_seconds_count_from_the_first_frame(tmp_path, monkeypatch):
+    class Late(Steady):
+        def start(self):
+            time.sleep(0.7)
+            super().start()
+
+    class Never(Steady):
+        def read(self):
+            return time.sleep(0.02) or []
+
+    state = recorded(tmp_path / "late", Late(frames=9999), until=Until(seconds=0.4))
+    assert 20 < state.streams["steady/depth"].frames < 200
+    monkeypatch.setattr(recorder, "FIRST_S", 0.3)
+    with pytest.raises(ResourceError, match="no frame came"):
+        recorded(tmp_path / "never", Never(), until=Until(seconds=0.2))
+
+
 # ---------------------------------------------------------------- clocks
 
 

@@ -28,6 +28,7 @@ FILE = "recording.mcap"
 FLUSH_S = 0.4  # what is in memory is written at least so often: with 0.1 s of polling, half a second
 RESERVE_BYTES = 32 * 2**20  # of free disk: a recording stops before, while there is room for its end
 POLL_S = 0.05  # the longest that keys and the clock wait
+FIRST_S = 15.0  # that a device may take until its first frame: the seconds asked for count from there
 STOP_S = 4.0  # devices are asked to stop, and their last frames awaited, for so long
 SILENT_S = 5.0  # a stream that began and gives nothing for so long is said
 RATE_S = 2.0  # over which a rate is taken
@@ -76,8 +77,8 @@ class Recording:
 
 @dataclass(frozen=True)
 class Until:
-    """When a recording ends by itself, and how often a shutter correction is asked for; None = never. waits : frames
-    are written only from the control's "start" on."""
+    """When a recording ends by itself, and how often a shutter correction is asked for; None = never. seconds : from
+    the first frame on. waits : frames are written only from the control's "start" on."""
 
     seconds: float | None = None
     depth_frames: int | None = None
@@ -145,6 +146,7 @@ class _Recorder:
         self._sinks: dict[int, list[_Sink]] = {}
         self._epoch_ns = time.time_ns() - time.monotonic_ns()  # taken once: the wall clock may jump afterwards
         self._begin_ns = time.monotonic_ns()
+        self._first_ns: int | None = None
         self._writer = McapWriter(out / FILE, "ros2", f"thermofusion {__version__}")
         entries = {"start_ns": str(self._epoch_ns + self._begin_ns), "flush_s": "0.5", "clock": "host monotonic"}
         self._writer.metadata("thermofusion", entries | {k: json.dumps(v) for k, v in said.items()})
@@ -221,6 +223,8 @@ class _Recorder:
     def _frame(self, row: int, said: Delivered) -> None:
         if not self.state.started or self.state.disk_full:
             return
+        if self._first_ns is None:
+            self._first_ns = time.monotonic_ns()
         try:
             self._sinks[row][said.frame.stream].write(said)
         except OSError as e:
@@ -277,8 +281,12 @@ class _Recorder:
         depth = [s.frames + s.lost for s in self.state.streams.values() if s.info.kind == "depth"]
         if self._until.depth_frames is not None and max(depth, default=0) >= self._until.depth_frames:
             return True
-        spent = (time.monotonic_ns() - self._begin_ns) * 1e-9
-        return self._until.seconds is not None and self.state.started and spent >= self._until.seconds
+        if self._until.seconds is None or not self.state.started:
+            return False
+        now_ns, wanted_ns = time.monotonic_ns(), self._until.seconds * 1e9
+        if self._first_ns is None:
+            return now_ns - self._begin_ns >= wanted_ns + FIRST_S * 1e9
+        return now_ns - self._first_ns >= wanted_ns
 
     def _ask(self, word: bytes) -> None:
         for worker in self._workers.values():
