@@ -40,7 +40,10 @@ def barycentric(uv: Float32) -> Float32:
 
 
 class RayScene:
-    """A mesh prepared for rays; Open3D is loaded when the first scene is made."""
+    """A mesh prepared for rays; Open3D is loaded when the first scene is made.
+
+    Rays are cast on the caller's thread: views are worked on side by side, and idle helpers of a cast would only turn.
+    """
 
     def __init__(self, vertices_m: NDArray, triangles: Int | NDArray) -> None:
         """vertices_m : (V, 3) m. triangles : (F, 3) indices."""
@@ -64,7 +67,7 @@ class RayScene:
 
     def hits(self, rays: Float32) -> Hits:
         """First hits of rays (N, 6): origin [m] and direction, as `rays_from` makes them."""
-        answer = self._scene.cast_rays(self._tensor(np.ascontiguousarray(rays, np.float32)))
+        answer = self._scene.cast_rays(self._tensor(np.ascontiguousarray(rays, np.float32)), nthreads=1)
         distance = answer["t_hit"].numpy()
         triangle = answer["primitive_ids"].numpy().astype(np.int64)
         triangle[~np.isfinite(distance)] = -1
@@ -72,7 +75,7 @@ class RayScene:
 
     def occluded(self, rays: Float32, near: float, far: float) -> Bool:
         """(N,) mask: something lies on a ray (N, 6) between `near` and `far`, in lengths of its direction."""
-        return np.asarray(self._scene.test_occlusions(self._tensor(rays), tnear=near, tfar=far).numpy())
+        return np.asarray(self._scene.test_occlusions(self._tensor(rays), tnear=near, tfar=far, nthreads=1).numpy())
 
     def closest(self, points_m: NDArray) -> Hits:
         """The mesh's nearest points to points (N, 3) m."""
