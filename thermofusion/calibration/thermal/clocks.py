@@ -34,6 +34,7 @@ MAX_DRIFT = 200e-6  # of a clock: crystals are within 100 ppm
 DRIFT_SIGMA = 50e-6  # what a crystal is expected to drift, where the recording says little
 RIVAL_S, RIVAL = 0.5, 1.15  # another offset farther away must be worse by this factor
 MAX_SIGMA_S = 0.01  # of the offset that is believed
+CALMEST = 0.3  # of all places' spread: no place of an outline is believed to be steadier
 GAP_M = 0.2  # between the subject and what is behind it
 STARTS = 3  # of the fine search: the best offsets that are refined
 GAP_S = 0.5  # depth frames farther apart are not interpolated between
@@ -144,8 +145,9 @@ class _Fit:
             late = np.broadcast_to((self.thermal_s - middle)[:, None], r.shape)[seen]
             y, v = r[seen], speed[seen]
             residual = float(mad_sigma(y)) + 1e-9
-            w = 1 / np.maximum(1, np.abs(y) / (1.5 * residual))
             column = np.broadcast_to(np.arange(r.shape[1]), r.shape)[seen]
+            spread = _spreads(r, CALMEST * residual)[column]
+            w = (residual / spread) ** 2 / np.maximum(1, np.abs(y) / (1.5 * spread))
             v, late_v = _centred(v, column, w), _centred(v * late, column, w)
             A = np.column_stack([v, late_v * DRIFT_SIGMA])
             # frames, not places, are independent: the sides of one picture move together
@@ -158,6 +160,11 @@ class _Fit:
             offset += float(step[0]) - float(step[1]) * DRIFT_SIGMA * middle
             sigma, used = float(np.sqrt(np.linalg.inv(N)[0, 0])), int(frames)
         return offset, drift, sigma, residual, used
+
+
+def _spreads(r: Float, least: float) -> Float:
+    """(D,) px: the spread of each place's residuals (M, D), at least `least`: arms come and go, flanks do not."""
+    return np.array([max(float(mad_sigma(c[np.isfinite(c)])), least) for c in r.T])
 
 
 def _centred(x: Float, column: NDArray, weight: Float) -> Float:
