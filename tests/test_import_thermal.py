@@ -212,6 +212,48 @@ def test_tables_in_every_dialect(tmp_path, text, encoding):
     np.testing.assert_allclose(degC, [[21.5, 22.25, 30, 36.125], [20, 21, 22, 23]], atol=2e-5)
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        '"21,5","22,25","30,0","36,125"\n"20,0","21,0","22,0","23,0"\n',
+        "21,5 22,25 30 36,125\n20 21 22 23\n",
+        "21.5,,30,36.125\n20,21,22,23\n",
+        "21.5,22.25,-nan(ind),36.125\n20,21,22,23\n",
+        "21.5,22.25,30,36.125\n20,21,--,23\n",
+    ],
+)
+def test_decimal_commas_and_missing_pixels_in_tables(tmp_path, text):
+    (tmp_path / "a.csv").write_text(text)
+    degC = read_thermal(tmp_path / "a.csv").apparent_degC(0)
+    assert degC.shape == (2, 4)
+    seen = np.isfinite(degC)
+    assert seen.sum() >= 7
+    np.testing.assert_allclose(degC[seen], np.array([[21.5, 22.25, 30, 36.125], [20, 21, 22, 23]])[seen], atol=2e-5)
+
+
+@pytest.mark.parametrize("between", ["\n", "Frame 2\n", "0;1\n"])
+def test_a_second_table_is_not_left_out_in_silence(tmp_path, between):
+    row = "21.5,22.25,30,36.125\n"
+    (tmp_path / "a.csv").write_text(row * 3 + between + row * 3)
+    with pytest.raises(ScanError, match=r"ends at line 4, and another begins.*one picture a file"):
+        read_thermal(tmp_path / "a.csv")
+
+
+def test_plain_numbers_of_other_programs(tmp_path):
+    degC = np.random.default_rng(2).normal(30, 3, (6, 8)).astype(np.float32)
+    for name, order in (("a.raw", "<f4"), ("b.raw", ">f4")):  # the first as DJI's own kit writes
+        (tmp_path / name).write_bytes(degC.astype(order).tobytes())
+        np.testing.assert_array_equal(read_thermal(tmp_path / name, shape=(6, 8)).apparent_degC(0), degC)
+    np.save(tmp_path / "channel.npy", degC[..., None])
+    np.testing.assert_array_equal(read_thermal(tmp_path / "channel.npy").apparent_degC(0), degC)
+    np.save(tmp_path / "twentieths.npy", degC * 20)
+    with pytest.raises(ScanError, match=r"no temperatures in degC.*--gain"):
+        read_thermal(tmp_path / "twentieths.npy")
+    np.testing.assert_allclose(
+        read_thermal(tmp_path / "twentieths.npy", ThermalSaid(0.05, 0)).apparent_degC(0), degC, rtol=1e-6
+    )
+
+
 def test_units_are_named_with_the_options_that_mend_them():
     degC = np.linspace(19, 36, 100)
     assert looks_like(degC) is None

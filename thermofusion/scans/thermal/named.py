@@ -46,8 +46,8 @@ _KINDS: tuple[tuple[Callable[[bytes, bytes, str], bool], str, str], ...] = (
     (
         _dji,
         "a DJI R-JPEG: its counts become temperatures by the vendor's own library alone",
-        "convert it with DJI's Thermal SDK (`dji_irp -a measure --measurefmt float32`, then NPY or float TIFF), or "
-        "export it from DJI Thermal Analysis Tool 3",
+        "convert each with DJI's Thermal SDK (`dji_irp -s IN.JPG -a measure --measurefmt float32 -o OUT.raw`); such "
+        ".raw files are read in the size that --rig states",
     ),
     (
         _hikmicro,

@@ -18,6 +18,8 @@ from .frames import APPARENT, ThermalFrames, ThermalSaid, one_frame
 from .units import looks_like
 
 SUFFIXES = (".tif", ".tiff", ".png", ".npy", ".pgm")
+FLOATS = 0.9  # share of numbers of a sensible size in a picture of floats; pairs of counts make huge or tiny ones
+PLAUSIBLE_DEGC = (-60.0, 200.0)  # the median of a picture
 USB_SHAPE = (192, 256)  # (H, W) of InfiRay's and Topdon's USB frames: a picture above, kelvin x 64 below
 
 
@@ -61,7 +63,20 @@ def as_said(stack: NDArray, said: ThermalSaid, place: object) -> tuple[NDArray, 
     if unit is not None:
         text = f"the values (median {np.nanmedian(stack):.6g}) look like {unit[0]}"
         raise ScanError(text, place=place, hint=f"give {unit[1]}, or what else they are")
+    if stack.dtype != np.uint16:
+        _plausible(stack, place)
     return (stack, None) if stack.dtype == np.uint16 else (stack.astype(np.float32), APPARENT)
+
+
+def _plausible(stack: NDArray, place: object) -> None:
+    """Raises ScanError where the middle of what should be °C is no temperature of a body in a room."""
+    finite = stack[np.isfinite(stack)]
+    median = float(np.median(finite)) if finite.size else 0.0
+    if not PLAUSIBLE_DEGC[0] < median < PLAUSIBLE_DEGC[1]:
+        text = f"the values (median {median:.6g}) are no temperatures in degC"
+        raise ScanError(
+            text, place=place, hint="say what they are: --gain K_PER_UNIT --offset-degC DEGC_AT_0, or --curve"
+        )
 
 
 def _stack(path: Path) -> tuple[NDArray, tuple[str, ...]]:
@@ -69,6 +84,8 @@ def _stack(path: Path) -> tuple[NDArray, tuple[str, ...]]:
     data = read_bytes(path, "thermal")
     if data[:6] == b"\x93NUMPY":
         array = read_npy(data, path)
+        if array.ndim > 2 and array.shape[-1] == 1:  # one channel, said by an axis of its own
+            array = array[..., 0]
         return (array if array.ndim == 3 else array[None]), ()
     if is_tiff(data):
         return _tiff(data, path)
@@ -81,7 +98,8 @@ def _tiff(data: bytes, path: Path) -> tuple[NDArray, tuple[str, ...]]:
         raise ScanError("the thermal TIFF is truncated or damaged", place=path, hint=COPY_AGAIN)
     sizes = {(p.width_px, p.height_px) for p in pages}
     if len(sizes) > 1 or sum(p.width_px * p.height_px for p in pages) > 64 * MAX_PIXELS or pages[0].width_px == 0:
-        raise ScanError(f"the pages of the TIFF differ in size or are too many ({len(pages)})", place=path)
+        text = f"the pages of the TIFF differ in size or are too many ({len(pages)})"
+        raise ScanError(text, place=path, hint="write its frames alone, without a small picture of them, or one a file")
     own = [decode_strips(data, p) for p in pages]
     if all(a is not None for a in own):
         images = [upright(a, p.orientation) for a, p in zip(own, pages, strict=True) if a is not None]
@@ -111,20 +129,33 @@ def _by_opencv(data: bytes, pages: list[TiffPage], path: Path) -> list[NDArray]:
 
 
 def read_raw(path: Path, said: ThermalSaid, shape: tuple[int, int] | None) -> ThermalFrames:
-    """Headerless 16-bit frames, little-endian; shape : (H, W) by the rig. USB frames hold kelvin x 64 below a picture.
+    """Headerless frames, little-endian: 16-bit, or float32 °C as DJI's kit writes; shape : (H, W) by the rig.
+
+    USB frames hold kelvin x 64 below a picture.
 
     Raises ScanError where the bytes are no frame of that size.
     """
     values = np.frombuffer(read_bytes(path, "thermal"), np.uint8)
     for h, w in (shape, USB_SHAPE) if shape is not None else (USB_SHAPE,):
         pixels = 2 * h * w
+        if (h, w) == shape and len(values) == 2 * pixels:
+            order = max(("<f4", ">f4"), key=lambda o: _of_a_size(values.view(o)))
+            if _of_a_size(values.view(order)) > FLOATS:
+                stack = values.view(order).reshape(1, h, w).astype(np.float32)
+                images, signal = as_said(stack, said, path)
+                return one_frame(images[0], path, signal)
         usb = len(values) == 2 * pixels and _is_kelvin64(values[pixels:])
         if usb or ((h, w) == shape and len(values) == pixels):
             stack = values[-pixels:].view("<u2").reshape(1, h, w).astype(np.uint16)
             images, signal = as_said(stack, ThermalSaid(1 / 64, -273.15) if usb else said, path)
             return one_frame(images[0], path, signal)
-    text = f"{len(values)} bytes without a header are no frame of 16 bits of a size that is known"
+    text = f"{len(values)} bytes without a header are no frame of 16-bit counts or float32 of a size that is known"
     raise ScanError(text, place=path, hint="give the thermal camera's size in --rig, or write PNG, TIFF or NPY")
+
+
+def _of_a_size(x: NDArray) -> float:
+    """Share of numbers that are neither tiny nor huge, as floats in the wrong byte order are."""
+    return float(np.mean((np.abs(x) > 1e-3) & (np.abs(x) < 1e4)))
 
 
 def _is_kelvin64(half: NDArray) -> bool:
