@@ -104,7 +104,8 @@ def look_points(mesh: SurfaceMesh, spacing_m: float) -> Int:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Where the solution stands. moved : (K, 6) what of the nodes' motion has become rest. area : (K,) points."""
+    """Where the solution stands. moved : (K, 6) what of the nodes' motion has become rest. area : (K,) points. normal :
+    of the points' rows, once there were some."""
 
     mesh: SurfaceMesh
     graph: NodeGraph
@@ -113,6 +114,7 @@ class _State:
     frames: CoarseFrames
     moved: Float
     area: Float
+    normal: Normal | None = None
 
     @classmethod
     def of(cls, mesh: SurfaceMesh, graph: NodeGraph, field: MotionField, frames: CoarseFrames) -> _State:
@@ -139,7 +141,8 @@ class _State:
         rest = replace(self.graph, at_m=field.node_m)
         held = held_matrix(rest, edge_matrix(rest))
         slow = Steps.of(rest, field.knot_s, field.twist)
-        solved = solve_motion(sums, Normal.of(J), J, field.twist, held, slow, 1 / CORRELATED)
+        normal = Normal.of(J) if self.normal is None else self.normal.again(J)
+        solved = solve_motion(sums, normal, J, field.twist, held, slow, 1 / CORRELATED)
         shift = np.clip(solved.shape_m, -MAX_SHIFT_M, MAX_SHIFT_M).astype(np.float32)
         points = replace(points, at_m=points.at_m + shift[:, None] * points.normal)
         T = se3_exp(unsteady(field, frames.times_s, steps)) @ frames.T_world_depth
@@ -149,6 +152,5 @@ class _State:
         mean = field.twist.mean(0)
         points = carried(points, affine(field.node_m, mean, points.binding))
         field = replace(field, node_m=field.node_m + mean[:, 3:], twist=field.twist - mean)
-        return replace(
-            self, points=points, field=field, frames=replace(frames, T_world_depth=T), moved=self.moved + mean
-        )
+        frames, moved = replace(frames, T_world_depth=T), self.moved + mean
+        return replace(self, points=points, field=field, frames=frames, moved=moved, normal=normal)

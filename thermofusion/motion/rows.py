@@ -8,9 +8,10 @@ equations are formed: three numbers a point and knot.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
 from ..robust import mad_sigma
@@ -176,7 +177,7 @@ def left_over(
         t = sight.residual_m / sigma
         w = 1 / ((1 + (t / CUT_SIGMAS) ** 2) * sigma**2)
         twist = _step(sight, w, sight.residual_m.astype(np.float64))
-        moved = np.cross(twist[:3], sight.at_m) + twist[3:]  # the measurements move with the camera
+        moved = cross(twist[None, :3], sight.at_m) + twist[3:]  # the measurements move with the camera
         t = np.abs(sight.residual_m + np.einsum("pi,pi->p", sight.normal, moved)) / sigma
         squares[sight.point] += np.minimum(t, CUT_SIGMAS) ** 2
         count[sight.point] += 1
@@ -193,12 +194,18 @@ def _step(sight: Sight, w: Float, r: Float) -> Float:
     middle = sight.at_m.mean(0)
     x = (sight.at_m - middle).astype(np.float64)
     n = sight.normal.astype(np.float64)
-    J = np.concatenate([np.cross(x, n), n], axis=1)
+    J = np.concatenate([cross(x, n), n], axis=1)
     H = J.T @ (w[:, None] * J)
     H[np.diag_indices(6)] += 1e-6 * np.trace(H)
     y = -np.linalg.solve(H, J.T @ (w * r))  # measured points are moved by the pose: n·(y) = -r
-    y[3:] -= np.cross(y[:3], middle)
+    y[3:] -= cross(y[:3], middle)
     return y
+
+
+def cross(a: NDArray, b: NDArray) -> NDArray:
+    """a x b along the last axis, to the bit as NumPy's, which spends most of its time on the names of axes."""
+    one, two = [1, 2, 0], [2, 0, 1]
+    return np.asarray(a[..., one] * b[..., two] - a[..., two] * b[..., one])
 
 
 def jacobian(points: BoundPoints, node_m: Float) -> csr_matrix:
@@ -207,7 +214,7 @@ def jacobian(points: BoundPoints, node_m: Float) -> csr_matrix:
     weight = points.binding.weight[points.binding.group].astype(np.float64)
     x = points.at_m.astype(np.float64)[:, None, :] - node_m[node]
     n = np.broadcast_to(points.normal.astype(np.float64)[:, None, :], x.shape)
-    rows = np.concatenate([np.cross(x, n), n], axis=2) * weight[:, :, None]
+    rows = np.concatenate([cross(x, n), n], axis=2) * weight[:, :, None]
     columns = 6 * node[:, :, None] + np.arange(6)
     P = len(points)
     return csr_matrix((rows.ravel(), columns.ravel(), np.arange(0, 24 * P + 1, 24)), shape=(P, 6 * len(node_m)))
@@ -216,27 +223,35 @@ def jacobian(points: BoundPoints, node_m: Float) -> csr_matrix:
 @dataclass(frozen=True, eq=False)
 class Normal:
     """Takes weights of points to normal matrices. products : (N, P) to the N distinct places that are not always 0;
-    place : (N,) these, flat, in an (m, m) matrix; mirror : (N,) their transposes'. size : m."""
+    place : (N,) these, flat, in an (m, m) matrix; mirror : (N,) their transposes'. size : m. order : of the products of
+    all rows' entries in `products`.
+    """
 
     products: csr_matrix
     place: Int
     mirror: Int
     size: int
+    order: Int
 
     @classmethod
     def of(cls, J: csr_matrix) -> Normal:
-        """Of rows J (P, m) with equally many entries each."""
+        """Of rows J (P, m) with equally many entries each, none twice in a row."""
         P, m = J.shape
-        value, column = J.data.reshape(P, -1).astype(np.float32), J.indices.reshape(P, -1).astype(np.int64)
-        upper = np.triu_indices(value.shape[1])
+        column = J.indices.reshape(P, -1).astype(np.int64)
+        upper = np.triu_indices(column.shape[1])
         a, b = column[:, upper[0]], column[:, upper[1]]
-        low, high = np.minimum(a, b), np.maximum(a, b)
-        place, row = np.unique((low * m + high).ravel(), return_inverse=True)
-        # equal columns do not occur twice in a row but on the diagonal
-        products = (value[:, upper[0]] * value[:, upper[1]]).ravel()
-        point = np.repeat(np.arange(P), len(upper[0]))
-        matrix = csr_matrix((products, (row.ravel(), point)), shape=(len(place), P))
-        return cls(matrix, place, place % m * m + place // m, m)
+        place, row = np.unique((np.minimum(a, b) * m + np.maximum(a, b)).ravel(), return_inverse=True)
+        number, point = np.arange(1, row.size + 1), np.repeat(np.arange(P), len(upper[0]))
+        matrix = csr_matrix((number, (row.ravel(), point)), shape=(len(place), P))
+        return cls(matrix, place, place % m * m + place // m, m, matrix.data - 1).again(J)
+
+    def again(self, J: csr_matrix) -> Normal:
+        """Of other rows with entries in the same places."""
+        value = J.data.reshape(J.shape[0], -1).astype(np.float32)
+        upper = np.triu_indices(value.shape[1])
+        products = (value[:, upper[0]] * value[:, upper[1]]).ravel()[self.order]
+        places = products, self.products.indices, self.products.indptr
+        return replace(self, products=csr_matrix(places, shape=self.products.shape))
 
     def matrix(self, weight: Float) -> Float:
         """(m, m) Σ w J'J for weights (P,)."""
