@@ -11,7 +11,7 @@ import numpy as np
 
 from ..errors import QualityError
 from ..geometry.rigid import invert, rotation_angle_deg, transform_points
-from ..robust import mad_sigma
+from ..robust import evenly, mad_sigma
 from ..scans.pairing import nearest_in_time
 from ..types import Bool, Float, ThermalStream
 from .frames import TrackingFrames
@@ -44,7 +44,7 @@ def held_against_pictures(frames: TrackingFrames, T: Float, tracked: Bool, *, al
     shift_m = float(np.linalg.norm(moved[:, :3, 3], axis=1).max())
     if rotation_angle_deg(moved).max() > STILL_DEG or shift_m > STILL_M:
         return
-    picked = np.unique(np.linspace(0, len(known) - 1, min(FRAMES, len(known))).astype(int))
+    picked = evenly(len(known), FRAMES)
     first = frames.load(int(known[0])).map
     depth = [changed_share(first, frames.load(int(known[k])).map, invert(moved[k])) for k in picked[1:]]
     if np.median(depth) < (CHANGED_ALONE if alone else CHANGED):
