@@ -140,6 +140,18 @@ def test_unknown_keys_are_kept_as_a_note(tmp_path):
 # ---------------------------------------------------------------- the table of readers
 
 
+def test_a_folder_around_one_recording_is_that_recording(tmp_path):
+    scan = make.tiny_scan()
+    (tmp_path / "walk").mkdir()
+    write_scan(scan, tmp_path / "walk/first")
+    found = open_scan(tmp_path / "walk")
+    assert len(found.depth) == len(scan.depth)
+    assert "read from first, the only recording in the folder" in found.notes
+    write_scan(scan, tmp_path / "walk/second")
+    with pytest.raises(ScanError, match=r"2 recordings here.*name one of them: first, second"):
+        open_scan(tmp_path / "walk")
+
+
 def test_unknown_format_names_the_nearest(tmp_path):
     with pytest.raises(RecipeError, match="did you mean 'redwood'"):
         open_scan(tmp_path, format="redwod")

@@ -14,9 +14,12 @@ from pathlib import Path
 from ..errors import RecipeError, ScanError, visible
 from ..files.reading import is_named
 from ..types import Scan
+from .naming import real_files
 from .native.compose import with_rig, with_thermal
 from .native.read import is_native, read_native
 from .stated import NOTHING, Stated, refused, unmirrored, with_times
+
+NAMED = 5  # recordings of a folder that a refusal names
 
 
 @dataclass(frozen=True)
@@ -106,11 +109,9 @@ def open_scan(
     except OSError as e:
         raise ScanError(f"it cannot be read ({e.strerror})", place=e.filename or root) from None
     if known is None:
-        raise ScanError(
-            "no known recording format was recognised here",
-            place=root,
-            hint=f"looked for {', '.join(f'{f.signs} ({f.name})' for f in FORMATS)}; name one with --format",
-        )
+        inside = _only_one_inside(root)
+        scan = open_scan(inside, stated=stated, times=times)
+        return replace(scan, notes=(*scan.notes, f"read from {visible(inside.name)}, the only recording in the folder"))
     beside = (root if root.is_dir() else root.parent) / "rig.json"
     if stated.rig is None and known.name != "native" and is_named(beside):
         stated = stated.with_rig(beside)
@@ -124,6 +125,26 @@ def open_scan(
     if times is not None:
         scan = with_times(scan, times)
     return unmirrored(scan) if stated.mirrored else scan
+
+
+def _only_one_inside(root: Path) -> Path:
+    """The one recording that lies in a folder which is none itself. Raises ScanError: there is none, or are several."""
+    try:
+        beside = sorted(root.iterdir()) if root.is_dir() else []
+        beside = real_files(beside) + [p for p in beside if p.is_dir() and not p.name.startswith(".")]
+        found = [p for p in beside if any(f.recognise(p) for f in FORMATS if f.name != "flir")]
+    except OSError as e:
+        raise ScanError(f"it cannot be read ({e.strerror})", place=e.filename or root) from None
+    if len(found) == 1:
+        return found[0]
+    if found:
+        names = ", ".join(visible(p.name) for p in found[:NAMED])
+        raise ScanError(f"there are {len(found)} recordings here", place=root, hint=f"name one of them: {names}")
+    raise ScanError(
+        "no known recording format was recognised here",
+        place=root,
+        hint=f"looked for {', '.join(f'{f.signs} ({f.name})' for f in FORMATS)}; name one with --format",
+    )
 
 
 def find_format(name: str) -> Format:
