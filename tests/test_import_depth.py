@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import struct
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -14,6 +16,7 @@ from support.foreign import GL, POSES, TIMES, Moments, plain, put
 from thermofusion.errors import QualityError, RecipeError, ScanError
 from thermofusion.geometry.rigid import rotation_angle_deg
 from thermofusion.scans import FORMATS, Stated, open_scan
+from thermofusion.scans.formats.sensors import ros
 from thermofusion.scans.native.write import write_scan
 from thermofusion.scans.overlay import looks_mirrored
 from thermofusion.tracking.recorded import believed
@@ -313,3 +316,20 @@ def test_folders_of_two_makers_name_their_fault(tmp_path):
     path, _ = foreign.sens(tmp_path / "sens")
     path.write_bytes(path.read_bytes()[:-200])
     assert len(open_scan(path).depth) == 2  # the whole frames before the tear
+
+
+def test_packed_depth_of_ros_is_the_depth():
+    mm = np.random.default_rng(3).integers(400, 4000, (6, 8)).astype(np.uint16)
+    mm[0, 0] = 0
+    png = cv2.imencode(".png", mm)[1].tobytes()
+    plain = SimpleNamespace(format="16UC1; compressedDepth png", data=bytes(12) + png)
+    np.testing.assert_array_equal(ros._image(plain, "here"), mm)
+    assert ros._packed(plain.format) == "16UC1"
+    A, B = 150.0, -20.0  # m = A / (value - B)
+    inverse = SimpleNamespace(format="32FC1; compressedDepth", data=struct.pack("<iff", 0, A, B) + png)
+    m = ros._image(inverse, "here")
+    assert np.isnan(m[0, 0])
+    np.testing.assert_allclose(m[1:], A / (mm[1:] - B), rtol=1e-6)
+    rvl = SimpleNamespace(format="16UC1; compressedDepth rvl", data=bytes(40))
+    with pytest.raises(ScanError, match=r"packed as .*rvl.*republish"):
+        ros._image(rvl, "here")

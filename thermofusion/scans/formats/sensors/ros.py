@@ -32,6 +32,7 @@ THERMAL_WORDS = ("thermal", "lepton", "boson", "flir", "optris", "lwir", "infrat
 COLOR_ENCODINGS = {"rgb8": None, "bgr8": cv2.COLOR_BGR2RGB, "rgba8": cv2.COLOR_RGBA2RGB, "bgra8": cv2.COLOR_BGRA2RGB}
 COLOR_ENCODINGS |= {"mono8": cv2.COLOR_GRAY2RGB}
 DEPTH_ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+PACKED_HEAD, PNG = 12, b"\x89PNG"  # of compressedDepth
 _ONE_AT_A_TIME = Lock()  # frames are asked for from several threads, and a bag has one place to read at
 HINT = "pip install 'thermofusion[ros]'"
 
@@ -156,8 +157,14 @@ def _topic(reader: Any, connection: Any) -> _Topic | None:
     order = sorted({s: i for i, s in reversed(list(enumerate(stamps)))}.items())  # each time once
     rows = [i for _, i in order]
     seconds = np.array([s + ns * 1e-9 for (s, ns), _ in order])
-    encoding = getattr(first, "encoding", None) or f"compressed {first.format}"
+    encoding = getattr(first, "encoding", None) or _packed(first.format)
     return _Topic(connection.topic, connection, encoding, first.header.frame_id, [log[i] for i in rows], seconds)
+
+
+def _packed(format: str) -> str:
+    """The encoding of a compressed topic: of depth what its packed image holds, e.g. `16UC1; compressedDepth png`."""
+    inside = format.split(";")[0].strip()
+    return inside if "compressedDepth" in format and inside in DEPTH_ENCODINGS else f"compressed {format}"
 
 
 def _kind(topic: _Topic) -> Kind | None:
@@ -193,6 +200,8 @@ def _loader(reader: Any, topic: _Topic, path: Path) -> Callable[[int], NDArray]:
 def _image(message: Any, place: object) -> NDArray:
     data = bytes(message.data)
     if not hasattr(message, "encoding"):
+        if "compressedDepth" in message.format:
+            return _unpacked(data, message.format, place)
         return as_loaded("color", decode_image(data, shape=None, kind="color", place=place), place, 1.0)
     h, w, step = message.height, message.width, message.step
     kind = DEPTH_ENCODINGS.get(message.encoding, "u1")
@@ -205,6 +214,24 @@ def _image(message: Any, place: object) -> NDArray:
     image = pixels.astype(kind).reshape((h, w, channels) if channels > 1 else (h, w))
     code = COLOR_ENCODINGS.get(message.encoding)
     return image if code is None else np.asarray(cv2.cvtColor(image, code))
+
+
+def _unpacked(data: bytes, format: str, place: object) -> NDArray:
+    """(H, W) of ROS's compressedDepth: 12 bytes (a number, two floats A and B), then a 16-bit PNG.
+
+    16UC1 is the PNG itself; 32FC1 is A / (value - B) metres, 0 = none.
+    """
+    if not data[PACKED_HEAD:].startswith(PNG):
+        hint = "play the bag into one with raw depth images (image_transport republish)"
+        raise ScanError(f"depth packed as '{format}' is not read, PNG alone is", place=place, hint=hint)
+    values = decode_image(data[PACKED_HEAD:], shape=None, kind="depth", place=place)
+    if values.dtype != np.uint16 or values.ndim != 2:
+        raise ScanError(f"packed depth is {values.dtype}, expected 16 bits and one channel", place=place)
+    if not format.startswith("32FC1"):
+        return values
+    A, B = np.frombuffer(data, "<f4", 2, 4)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(values > 0, A / (values.astype(np.float32) - B), np.nan).astype(np.float32)
 
 
 # ---------------------------------------------------------------- cameras and their places
