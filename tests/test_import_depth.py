@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 from support import foreign
 from support.foreign import GL, POSES, TIMES, Moments, plain, put
+from typer.testing import CliRunner
 
+from thermofusion.cli import app
 from thermofusion.errors import QualityError, RecipeError, ScanError
 from thermofusion.geometry.rigid import rotation_angle_deg
 from thermofusion.scans import FORMATS, Stated, open_scan
@@ -333,3 +335,22 @@ def test_packed_depth_of_ros_is_the_depth():
     rvl = SimpleNamespace(format="16UC1; compressedDepth rvl", data=bytes(40))
     with pytest.raises(ScanError, match=r"packed as .*rvl.*republish"):
         ros._image(rvl, "here")
+
+
+def test_a_unit_of_depth_has_a_name_or_a_number_and_no_step_is_a_metre(tmp_path):
+    m = Moments()
+    root = plain(tmp_path / "take", m, lambda m, i: cv2.imencode(".png", m.mm(i))[1].tobytes(), ".png")
+
+    def unit(text):
+        out = tmp_path / "out"
+        result = CliRunner().invoke(app, ["import", str(root), "--depth-unit", text, "-o", str(out), "--overwrite"])
+        return result, out
+
+    for text in ("mm", "0,001", "0.001"):
+        result, out = unit(text)
+        assert result.exit_code == 0, result.output
+        np.testing.assert_array_equal(open_scan(out).depth.load(0), open_scan(root).depth.load(0))
+    for text in ("m", "1000", "parsec", "nan"):
+        result, out = unit(text)
+        assert isinstance(result.exception, (RecipeError, SystemExit))
+        assert result.exit_code != 0

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 Force = Annotated[bool, typer.Option("--overwrite", help="Replace an existing scan folder.")]
 
 
+UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+LARGEST_STEP_M = 0.1  # that scan.json takes
+
+
 @dataclass(frozen=True)
 class DepthOptions:
     """What a person says of the depth recording."""
@@ -29,7 +33,9 @@ class DepthOptions:
     rig: Annotated[Path | None, typer.Option(help="rig.json with the cameras; with --thermal: its thermal camera.")] = (
         None
     )
-    depth_unit: Annotated[float | None, typer.Option(help="Metres a step of the stored depth: 0.001 = mm.")] = None
+    depth_unit: Annotated[
+        str | None, typer.Option(help="Of the stored depth: mm, cm, m, or metres a step, 0.001 = mm.")
+    ] = None
     size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT of depth images without a header.")] = None
     mirrored: Annotated[bool, typer.Option("--mirrored", help="Depth and colour are as in a mirror.")] = False
 
@@ -80,11 +86,14 @@ def import_(
         )
     if added.thermal is None and _said_of_thermal(added):
         raise RecipeError(f"{_said_of_thermal(added)[0]} is for thermal frames: it needs --thermal")
-    stated = Stated(depth_unit_m=_positive(depth.depth_unit), size_px=_size(depth.size), mirrored=depth.mirrored)
+    stated = Stated(depth_unit_m=_depth_unit(depth.depth_unit), size_px=_size(depth.size), mirrored=depth.mirrored)
     if depth.rig is not None and added.thermal is None:
         stated = stated.with_rig(depth.rig)  # beside thermal it is for the thermal camera alone
     times = added.times if added.thermal is None else None
     scan = open_scan(recording, format=depth.format, stated=stated, times=times)
+    if not scan.depth_unit_m <= LARGEST_STEP_M:
+        text = f"depth in whole steps of {scan.depth_unit_m:g} m is none"
+        raise RecipeError(text, hint="--depth-unit mm, or metres a step: 0.001 = mm, 0.0002 = 5000 a metre")
     if added.thermal is not None and depth.rig is not None:
         scan = _join(scan, added, depth.rig)
     with progress(json) as step:
@@ -198,8 +207,19 @@ def _number(name: str, text: str) -> float:
     return value
 
 
-def _positive(value: float | None, name: str = "--depth-unit") -> float | None:
-    if value is not None and not 0 < value < float("inf"):
+def _depth_unit(text: str | None) -> float | None:
+    """Metres, of a unit by its name or as a number."""
+    if text is None:
+        return None
+    try:
+        value = UNITS_M.get(text.strip().lower()) or float(text.strip().replace(",", "."))
+    except ValueError:
+        raise RecipeError(f"--depth-unit: expected {', '.join(UNITS_M)} or metres a step, got '{text}'") from None
+    return _positive(value, "--depth-unit")
+
+
+def _positive(value: float, name: str) -> float:
+    if not 0 < value < float("inf"):
         raise RecipeError(f"{name}: expected a number above 0, got {value}")
     return value
 
