@@ -39,7 +39,7 @@ STAGES = (
     Stage("surface", ("input", "subject", "surface"), edition=8),
     Stage("rig", ("input", "rig"), edition=6),
     Stage("mapping", ("input", "mapping"), edition=12),
-    Stage("temperature", ("mapping", "temperature"), edition=18, handed_out=RESULT),
+    Stage("temperature", ("mapping", "temperature"), edition=19, handed_out=RESULT),
 )
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
 KEPT_THERMAL_BYTES = 64 << 20  # of images that are not decoded twice

@@ -30,7 +30,7 @@ from ..physics.equation import without_gain
 from ..robust import MAD_PER_SIGMA, NORMAL_95, evenly, median
 from ..types import Bool, Float, Float32, Observations, brief
 from .gain import GAIN_SPAN_K, gain_of_readings
-from .hidden import with_pattern
+from .hidden import with_hidden
 from .layout import Layout
 from .mean import Groups
 from .problem import ThermalProblem
@@ -390,7 +390,7 @@ def _result(overlap: Overlap, refinement: Refinement | None) -> Calibration:
     """The solution in terms of views and the whole field."""
     problem, system, solution, rows, held, change = vars(overlap).values()
     if refinement is not None and problem.settings.crosscal.vignetting:
-        solution = with_pattern(system, solution, rows, problem.lens.width_px, refinement.hidden_K)
+        solution = with_hidden(system, solution, rows, problem.points_m[rows.vertex], refinement.hidden_K)
     at, n, slope = system.layout, problem.n_views, system.slope_L
     group = np.arange(n) if problem.settings.crosscal.offsets else np.zeros(n, np.intp)
     shape_bias = _shape_bias(problem.emissivity, problem.errors.sigma_normal_deg)
