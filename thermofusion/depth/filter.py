@@ -24,7 +24,7 @@ MIN_NEIGHBOURS = 3  # of 8: what the corner of a surface still has, and a one-pi
 CELL_PX = 4  # slopes are taken between means over squares of this size: single pixels carry only noise
 MIN_CELL_SHARE = 0.25  # of a cell's pixels that must hold depth
 READERS = 2  # threads that decode frames ahead
-KEPT_BYTES = 256 << 20  # of images that are not decoded twice
+KEPT_BYTES = 128 << 20  # of images that are not decoded twice
 
 
 def filter_depth(depth_m: Float32, camera: Camera, section: InputSection) -> Float32:
