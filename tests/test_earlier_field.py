@@ -115,11 +115,15 @@ def test_a_result_folder_hands_its_field_on(found, earlier, tmp_path):
     surface = SurfaceMesh(np.zeros((1, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((1, 3), np.float32))
     mesh = ThermalMesh.from_temperature(surface, nan, mode="absolute", anchored=False)
     save_artifact(tmp_path / "result.npz", Temperature(mesh, nan, nan, nan, calibration=found))
-    report = {"scan": {"recorded_at": "2026-03-01T11:00:00+00:00"}, "metadata": []}
+    report = {"thermofusion": "0", "scan": {"recorded_at": "2026-03-01T11:00:00+00:00"}, "metadata": []}
     (tmp_path / "result.json").write_text(json.dumps(report))
     recipe = with_field(load_recipe("torso"), scan, tmp_path)
     assert recipe.temperature.crosscal.field == earlier.model_copy(update={"age_days": 2.0})
     assert load_recipe(recipe.model_dump(mode="json")) == recipe
+    (tmp_path / "result.json").write_text("[]")
+    with pytest.raises(ScanError, match="not what thermofusion wrote"):
+        with_field(recipe, scan, tmp_path)
+    (tmp_path / "result.json").write_text(json.dumps(report))
     other = replace(found, field=replace(found.field, width_px=640))
     save_artifact(tmp_path / "result.npz", Temperature(mesh, nan, nan, nan, calibration=other))
     with pytest.raises(ScanError, match="of 640 x 240 px, the thermal images of 320 x 240"):

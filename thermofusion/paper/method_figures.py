@@ -28,7 +28,7 @@ def _figure(stem: str, cases: Sequence[Case]) -> Figure:
     numbers = []
     for case in cases:
         for method in METHODS:
-            e = case.truth.error(by_method(case.scan, case.recipe, case.result, method), case.result.trajectory)
+            e = case.truth.error(_by_method(case.scan, case.recipe, case.result, method), case.result.trajectory)
             for key, value in zip(rows, (case.name, method, e.vertices, e.level_K, e.rms_K, e.p95_K), strict=True):
                 rows[key].append(value)
             numbers.append(Number(f"{case.name}, {method}: rms error, level removed", e.rms_K, "K"))
@@ -36,7 +36,7 @@ def _figure(stem: str, cases: Sequence[Case]) -> Figure:
     return Figure(stem, "Every method against the truth", tables={"": rows}, numbers=numbers, notes=[note])
 
 
-def by_method(scan: Scan, recipe: Recipe, result: Result, method: str) -> ThermalMesh:
+def _by_method(scan: Scan, recipe: Recipe, result: Result, method: str) -> ThermalMesh:
     """The same surface and observations, blended by another method; in the result's frame, as its trajectory is."""
     assert result.surface is not None
     assert result.frame is not None

@@ -97,7 +97,7 @@ def _apart(folder: Path, scan: Scan) -> None:
 
 def _own(folder: Path, scan: Scan, names: list[str], left: list[str]) -> None:
     """Refuse a folder with somebody's files, or with another scan's result."""
-    report = _report(folder)
+    report = report_in(folder)
     there = [p for p in folder.iterdir() if p.name not in (LOCK, WORK) and not LEFTOVER.fullmatch(p.name)]
     ours = bool(report) or (folder / WORK).is_dir()
     foreign = next((p for p in there if not ours and not p.is_dir()), None)
@@ -123,7 +123,8 @@ def _clear(folder: Path, names: list[str]) -> None:
             raise ResourceError("a folder stands where a file of the result belongs", place=folder / name)
 
 
-def _report(folder: Path) -> dict | None:
+def report_in(folder: Path) -> dict | None:
+    """The report of a result; None where there is none, or none of ours."""
     try:
         report = read_json(folder / REPORT)
     except ScanError:
@@ -133,7 +134,7 @@ def _report(folder: Path) -> dict | None:
 
 def listed(folder: Path) -> list[str]:
     """The files that a finished result consists of, by its own word; empty without one."""
-    report = _report(folder)
+    report = report_in(folder)
     if report is None:  # killed while it changed over?
         try:
             report = {"files": read_json(folder / CHANGING)}

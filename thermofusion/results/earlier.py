@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import ScanError
-from ..files.reading import read_json
 from ..recipe import Recipe
 from ..report.metadata import stated
 from ..temperature.sensor.earlier import SAME_CAMERA, handed_on, refuse_another_image
 from ..types import Scan
-from .claim import REPORT
+from .claim import REPORT, report_in
 from .folder import load_temperature
 
 DAY_S = 86_400.0
@@ -27,7 +26,10 @@ def with_field(recipe: Recipe, scan: Scan, folder: Path) -> Recipe:
     if calibration is None or not calibration.field.coefficients.any():
         hint = "a result of several thermal views has one (temperature.method = joint)"
         raise ScanError("this result found no field of the camera", place=folder, hint=hint)
-    report = read_json(folder / REPORT)
+    report = report_in(folder)
+    if report is None:
+        hint = "`thermofusion run` writes it again"
+        raise ScanError("it is not what thermofusion wrote", place=folder / REPORT, hint=hint)
     serials = _serial(report.get("metadata", [])), _serial(stated(scan))
     if None not in serials and serials[0] != serials[1]:
         raise ScanError(

@@ -363,7 +363,7 @@ def _without_uncarried(system: OverlapSystem, solution: Solution) -> tuple[Overl
     K, held, keep, use_shape = at.n_patterns, [], system.keep, system.use_shape
     if K:
         # in units of what was known before: a combination of patterns that the data tell nothing of keeps a sigma of 1
-        prior = np.sqrt(1 / np.diag(FieldPrior.wide(system.field, system.slope_L).precision))
+        prior = np.sqrt(1 / FieldPrior.wide(system.field, system.slope_L).precision)
         values, vectors = np.linalg.eigh(solution.covariance[at.field, at.field] / np.outer(prior, prior))
         carried = np.sqrt(np.maximum(values, 0)) < FIELD_HELD
         if not carried.all():

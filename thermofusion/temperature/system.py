@@ -326,7 +326,7 @@ class OverlapSystem:
         at = self.layout
         M = at.n_offsets
         N[at.offsets, at.offsets] += (OFFSET_PRIOR_K * self.slope_L) ** -2 * (np.eye(M) - 1 / M)
-        known = self.field_prior.precision @ self.keep
+        known = self.field_prior.precision[:, None] * self.keep
         N[at.field, at.field] += self.keep.T @ known
         rhs[at.field] += self.field_prior.mean @ known
         N[at.shape, at.shape] += SHAPE_PRIOR**-2

@@ -17,12 +17,11 @@ from scipy.linalg import solve_triangular
 from ...types import Float
 
 LEAST_LEFT = 0.1  # of what is known along a direction must stay when a view is left out: else it is not left out there
-WHISPER = 1e-12  # on the diagonal, for what nothing was seen of
+WHISPER = 1e-12  # of the diagonal
 
 
-def by_views(J: sp.csr_matrix, e: Float, view: np.ndarray, boards: Sequence[np.ndarray]) -> tuple[Float, float]:
-    """(F, F) covariance of F free unknowns, those that all views share and those of each view's own board; and the
-    mean over directions of how much larger it is than for independent residuals.
+def by_views(J: sp.csr_matrix, e: Float, view: np.ndarray, boards: Sequence[np.ndarray]) -> Float:
+    """(F, F) covariance of F free unknowns: those that all views share, and those of each view's own board.
 
     J (M, F), e (M,) : whitened Jacobian and residuals at the solution; view (D,) : of the first D rows, the rest are
     priors; boards : columns of each view's board. Along each direction of the shared unknowns, in units of what
@@ -36,7 +35,7 @@ def by_views(J: sp.csr_matrix, e: Float, view: np.ndarray, boards: Sequence[np.n
     for number, own in enumerate(boards):
         rows = np.flatnonzero(view == number)
         A, Q = J[rows][:, shared].toarray(), J[rows][:, own].toarray()
-        N = _certain(Q.T @ Q)
+        N = whispered(Q.T @ Q)
         G = np.linalg.solve(N, Q.T @ A)  # the board follows the shared unknowns
         A = A - Q @ G
         followed.append((own, G, np.linalg.inv(N)))
@@ -49,15 +48,16 @@ def by_views(J: sp.csr_matrix, e: Float, view: np.ndarray, boards: Sequence[np.n
         follows[own] = -G
         out[np.ix_(own, own)] = of_its_own
     if not len(shared):
-        return out, 1.0
-    L = np.asarray(np.linalg.cholesky(_certain(information)), np.float64)
+        return out
+    L = np.asarray(np.linalg.cholesky(whispered(information)), np.float64)
     shifts = np.array([_left_out(L, *part) for part in parts])
     values, vectors = _larger(shifts)
     root = follows @ solve_triangular(L, vectors * np.sqrt(values), trans="T", lower=True)
-    return out + root @ root.T, float(values.mean())
+    return out + root @ root.T
 
 
-def _certain(N: Float) -> Float:
+def whispered(N: Float) -> Float:
+    """A normal matrix (F, F), changed in place: a whisper more on its diagonal, for unknowns nothing was seen of."""
     N[np.diag_indices_from(N)] *= 1 + WHISPER
     return N
 

@@ -101,7 +101,7 @@ def calibrate_views(
         start = DepthStart(depth_images, model, depth_camera, depth_lens_known, T, free_spacing, lens, T)
         fit, more = add_depth(fit, single, start)
         held = held + more
-    return _assemble(fit.resampled()[0], single, grouping, group, (*notes, *held))
+    return _assemble(fit.resampled(), single, grouping, group, (*notes, *held))
 
 
 def _refuse_mirrored_pairs(single: dict[str, SingleFit]) -> None:

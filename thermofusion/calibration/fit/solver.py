@@ -13,7 +13,7 @@ from scipy.sparse.linalg import LinearOperator
 from ...types import Float
 from .bundle import Options, Problem
 from .cameras import from_rt
-from .covariance import by_views
+from .covariance import by_views, whispered
 
 ROBUST_SIGMAS = 2.5  # residuals beyond this many sigmas count linearly (Huber)
 ROBUST_START = 6.0  # the first round is milder, so that a poor start does not throw good points away
@@ -53,17 +53,16 @@ class Fit:
         s = self.problem.slices[key]
         return self.covariance[s, s]
 
-    def resampled(self) -> tuple[Fit, float]:
-        """The fit with a covariance that knows what residuals of a view have in common (`covariance.by_views`); and
-        how much larger than for independent residuals variances are on average."""
+    def resampled(self) -> Fit:
+        """The fit with a covariance that knows what residuals of a view have in common (`covariance.by_views`)."""
         p, free = self.problem, self.free
         weight = p.weights(self.x, self.options, ROBUST_SIGMAS) if self.options.robust else None
         e, J = p.linearise(self.x, self.options, weight)
         number = np.cumsum(free) - 1
         boards = [number[s][free[s]] for s in (p.slices[f"view:{v.name}"] for v in p.views)]
         covariance = np.zeros_like(self.covariance)
-        covariance[np.ix_(free, free)], larger = by_views(J[:, free].tocsr(), e, p.row_views(), boards)
-        return replace(self, covariance=covariance), larger
+        covariance[np.ix_(free, free)] = by_views(J[:, free].tocsr(), e, p.row_views(), boards)
+        return replace(self, covariance=covariance)
 
     def residuals(self) -> dict[str, tuple[Float, np.ndarray]]:
         """By camera: (N, 2) px, and the view number of each; `depth_plane`: (N,) in sigmas of the samples."""
@@ -144,7 +143,5 @@ def _round(
 
 
 def _normal_matrix(J: sp.csr_matrix) -> Float:
-    """(F, F) JᵀJ, with a whisper on the diagonal for blocks nothing was seen of."""
-    H = (J.T @ J).toarray()
-    H[np.diag_indices_from(H)] *= 1 + 1e-12
-    return H
+    """(F, F) JᵀJ, invertible where nothing was seen of a block."""
+    return whispered((J.T @ J).toarray())

@@ -17,13 +17,17 @@ from .shown import table
 FIELD_PRIOR_K = {1: 0.15, 2: 0.15, 3: 0.07, 4: 0.07}  # rms of a field pattern by polynomial order; 0.1-0.3 K together
 CHANGES = np.geomspace(0.03, 3.0, 41)  # by which a field may have changed, over what fields are
 CHANGED_AT_ALL = 0.5  # beyond it the earlier field says no more than that fields are small
-
 SAME_CAMERA = "give --field a result of the same camera"
+
+
+def usual_K(field: ImageField) -> Float:
+    """(K,) rms of each pattern of a field, as cameras have it."""
+    return np.array([FIELD_PRIOR_K[n] for n in field.orders])
 
 
 @dataclass(frozen=True, eq=False)
 class FieldPrior:
-    """The field's coefficients before the data: mean (K,), W m-2 sr-1; precision (K, K), its inverse covariance."""
+    """The field's coefficients before the data, independent: mean (K,), W m-2 sr-1; precision (K,), 1/variance."""
 
     mean: Float
     precision: Float
@@ -31,8 +35,8 @@ class FieldPrior:
     @classmethod
     def wide(cls, field: ImageField, slope_L: float) -> FieldPrior:
         """Of a camera that nothing is known of. slope_L : dL/dT, W m-2 sr-1 K-1."""
-        usual = np.array([FIELD_PRIOR_K[n] * slope_L for n in field.orders])
-        return cls(np.zeros(len(usual)), np.diag(usual**-2.0))
+        usual = usual_K(field) * slope_L
+        return cls(np.zeros(len(usual)), usual**-2.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +53,7 @@ class EarlierField:
         if section is None:
             return None
         refuse_another_image(section, field.width_px, field.height_px)
-        usual = np.array([FIELD_PRIOR_K[n] for n in field.orders]) * slope_L
-        return cls(np.array(section.K) * slope_L, np.array(section.sigma_K) * slope_L, usual)
+        return cls(np.array(section.K) * slope_L, np.array(section.sigma_K) * slope_L, usual_K(field) * slope_L)
 
     def change(self, found: Float, covariance: Float) -> float:
         """Share of the usual size of fields by which this one changed since: the mean over its likelihood.
@@ -68,7 +71,7 @@ class EarlierField:
 
     def prior(self, change: float) -> FieldPrior:
         """What it says of a field that changed by such a share since."""
-        return FieldPrior(self.mean, np.diag(1 / (self.sigma**2 + (change * self.usual) ** 2)))
+        return FieldPrior(self.mean, 1 / (self.sigma**2 + (change * self.usual) ** 2))
 
 
 def refuse_another_image(section: EarlierFieldSection, width_px: int, height_px: int) -> None:
@@ -91,8 +94,7 @@ def handed_on(field: ImageField, sensor: Pattern | None, covariance: NDArray, sl
     columns = np.column_stack([np.ones(len(u)), field.patterns(u, v)])
     K = np.linalg.lstsq(columns, shown["K"].ravel(), rcond=None)[0][1:]
     sigma_K = np.sqrt(np.maximum(np.diag(covariance), 0.0)) / slope_L
-    usual_K = np.array([FIELD_PRIOR_K[n] for n in field.orders])
-    sigma_K = np.where(sigma_K > 0, sigma_K, usual_K)  # what was held is not known to be zero
+    sigma_K = np.where(sigma_K > 0, sigma_K, usual_K(field))  # what was held is not known to be zero
     return EarlierFieldSection(
         K=tuple(np.round(K, 5).tolist()),
         sigma_K=tuple(np.round(sigma_K, 5).tolist()),
