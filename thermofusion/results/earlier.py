@@ -28,7 +28,7 @@ def with_field(recipe: Recipe, scan: Scan, folder: Path) -> Recipe:
         raise ScanError("this result found no field of the camera", place=folder, hint=hint)
     report = report_in(folder)
     if report is None:
-        hint = "`thermofusion run` writes it again"
+        hint = "`thermofusion run SCAN -o RESULT` writes it again"
         raise ScanError("it is not what thermofusion wrote", place=folder / REPORT, hint=hint)
     serials = _serial(report.get("metadata", [])), _serial(stated(scan))
     if None not in serials and serials[0] != serials[1]:
